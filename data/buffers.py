@@ -1,0 +1,143 @@
+"""The vocabulary of buffers: what each image of a frame is called and what its numbers mean.
+
+This is a leaf module (standard library only) that every other part shares. A *buffer* is an image of one
+frame; a *frame number* is one value, or a few, that belong to the whole frame and not to a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Kind = Literal["radiance", "ratio", "vector", "distance", "count", "variance"]
+Repair = Literal["neighbours", "no_hit"]
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """One entry of the vocabulary.
+
+    Attributes:
+        name: The word used everywhere: in batches, shards, exported artifacts and our own EXR files.
+        channels: Number of channels, or 0 where a list of channels describes the buffer (`samples`).
+        letters: EXR channel letters in the order of the array's channels.
+        kind: `radiance` scales with exposure, `vector` turns with the image if it lives in the image plane.
+        unit: Unit of the stored value.
+        low: Smallest legal value (None: unbounded).
+        high: Largest legal value (None: unbounded).
+        no_hit: Value of a pixel whose rays left the scene.
+        half: Whether half precision holds its range and precision.
+        repair: What replaces NaN and Inf: the mean of the finite 3x3 neighbours, or `no_hit`.
+        meaning: One sentence.
+    """
+
+    name: str
+    channels: int
+    letters: str
+    kind: Kind
+    unit: str
+    low: float | None
+    high: float | None
+    no_hit: float
+    half: bool
+    repair: Repair
+    meaning: str
+
+
+def _radiance(name: str, meaning: str) -> Buffer:
+    return Buffer(name, 3, "RGB", "radiance", "linear radiance", 0.0, None, 0.0, True, "neighbours", meaning)
+
+
+_PLAIN = (
+    _radiance("color", "Noisy radiance, with albedo."),
+    _radiance(
+        "irradiance",
+        "Radiance divided by `albedo`; of this frame alone, or accumulated over the preceding frames where "
+        "the frame or the manifest says so.",
+    ),
+    Buffer(
+        "albedo", 3, "RGB", "ratio", "reflectance", 0.0, None, 1.0, True, "no_hit",
+        "Effective albedo that `irradiance` was divided by: diffuse plus specular reflectance, 1 where "
+        "nothing is known (emitters, background).",
+    ),
+    Buffer(
+        "diffuse_albedo", 3, "RGB", "ratio", "reflectance", 0.0, 1.0, 0.0, True, "no_hit",
+        "Diffuse reflectance of the first hit, 0 without a diffuse lobe.",
+    ),
+    Buffer(
+        "specular_albedo", 3, "RGB", "ratio", "reflectance", 0.0, 1.0, 0.0, True, "no_hit",
+        "Specular reflectance of the first hit at normal incidence, 0 for diffuse surfaces.",
+    ),
+    Buffer(
+        "normal", 3, "XYZ", "vector", "unit vector", -1.0, 1.0, 0.0, True, "no_hit",
+        "Shading normal in world space, shorter than 1 where a pixel mixes surfaces.",
+    ),
+    Buffer(
+        "depth", 1, "Z", "distance", "scene units", 0.0, None, 0.0, False, "no_hit",
+        "Distance from the camera; z or Euclidean as the manifest says.",
+    ),
+    Buffer(
+        "position", 3, "XYZ", "distance", "scene units", None, None, 0.0, False, "no_hit",
+        "First hit in world space.",
+    ),
+    Buffer(
+        "motion", 2, "XY", "vector", "pixels", None, None, 0.0, True, "no_hit",
+        "Previous pixel minus this pixel of the same world point; x to the right, y down.",
+    ),
+    Buffer(
+        "visibility", 1, "Z", "ratio", "fraction", 0.0, 1.0, 0.0, True, "no_hit",
+        "Unoccluded fraction of the light samples.",
+    ),
+    Buffer(
+        "roughness", 1, "Z", "ratio", "microfacet alpha", 0.0, 1.0, 0.0, True, "no_hit",
+        "Roughness of the first hit: 0 smooth, 1 diffuse.",
+    ),
+    Buffer(
+        "hit", 1, "Z", "ratio", "fraction", 0.0, 1.0, 0.0, True, "no_hit",
+        "Fraction of the pixel's samples that hit something.",
+    ),
+    _radiance("diffuse", "Radiance that left the first hit through its diffuse lobe, with albedo."),
+    _radiance("specular", "Radiance that left the first hit through its specular lobes."),
+    _radiance("reference", "Converged radiance, with albedo: the target."),
+    Buffer(
+        "history", 1, "Z", "count", "frames", 0.0, None, 1.0, True, "no_hit",
+        "Number of frames accumulated in `irradiance`.",
+    ),
+)
+
+
+def _derived(buffer: Buffer) -> tuple[Buffer, ...]:
+    halves = tuple(
+        replace(buffer, name=f"{buffer.name}_{half}", meaning=f"Half {half.upper()} of `{buffer.name}`.")
+        for half in "ab"
+    )
+    variance = replace(
+        buffer, name=f"{buffer.name}_variance", kind="variance", low=0.0, high=None, no_hit=0.0, half=False,
+        repair="no_hit", meaning=f"Variance of the mean of `{buffer.name}`, per channel.",
+    )
+    return (*halves, variance)
+
+
+BUFFERS: dict[str, Buffer] = {b.name: b for b in _PLAIN}
+BUFFERS |= {
+    d.name: d for b in _PLAIN if b.name not in ("reference", "history", "hit") for d in _derived(b)
+}
+
+FRAME_NUMBERS: dict[str, int] = {"exposure": 1, "depth_range": 2}
+"""Numbers of a whole frame and how many each has: the factor that brings radiance to a displayable level
+(1 where absent) and the smallest and largest depth of the whole frame, which a crop cannot know."""
+
+
+def buffer(name: str) -> Buffer:
+    """Return the vocabulary entry called `name`.
+
+    Raises:
+        ValueError: The name is not in the vocabulary; the message lists what is.
+    """
+    try:
+        return BUFFERS[name]
+    except KeyError:
+        plain = ", ".join(b.name for b in _PLAIN)
+        raise ValueError(
+            f"unknown buffer {name!r}; known: {plain}, each also as <name>_a, <name>_b, <name>_variance"
+        ) from None

@@ -1,0 +1,1 @@
+"""One module per published on-disk layout; each has `frames(root)`."""

@@ -1,0 +1,1 @@
+"""Shards of training patches: writing and reading."""

@@ -1,0 +1,1 @@
+"""Denoisers: torch only, no files, no Lightning, no MLflow."""

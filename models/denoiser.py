@@ -1,0 +1,113 @@
+"""The contract that every denoiser keeps, learned or not.
+
+Shape letters: B batch, T frames, S samples per pixel, C channels, H rows, W columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from data.buffers import FRAME_NUMBERS, buffer
+
+Buffers = Mapping[str, Tensor]
+
+
+class Denoised(NamedTuple):
+    """What a denoiser returns.
+
+    Attributes:
+        color: Linear radiance (B, 3, H, W) in the units of the input.
+        state: What a recurrent method carries to the next frame, otherwise None.
+    """
+
+    color: Tensor
+    state: Any = None
+
+
+class Denoiser(nn.Module):
+    """Base class: raw buffers in, linear radiance out.
+
+    Inputs are raw: linear radiance, world-space normals, depth in scene units. Every transform a network
+    needs happens inside, so exported artifacts take what a renderer wrote. Beside images a mapping may hold
+    frame numbers (`data.buffers.FRAME_NUMBERS`): `exposure` (B,) and whatever `measure` returns.
+
+    Attributes:
+        inputs: Names of the buffers that the method reads.
+        frame_numbers: Names of the frame numbers that it reads when they are given.
+        halo: Pixels of context on each side that an output pixel depends on.
+        multiple: Height and width must divide by it; the tiler pads.
+        temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
+        per_sample: Buffers carry a sample axis (B, S, C, H, W).
+    """
+
+    inputs: tuple[str, ...] = ()
+    frame_numbers: tuple[str, ...] = ()
+    halo: int = 0
+    multiple: int = 1
+    temporal: bool = False
+    per_sample: bool = False
+
+    def forward(self, buffers: Buffers) -> Denoised:
+        """Denoise a batch of images.
+
+        Args:
+            buffers: Tensors (B, C, H, W) for each name of `inputs`, and optionally frame numbers.
+
+        Raises:
+            ValueError: A buffer is missing or has another shape (see `check`).
+        """
+        raise TypeError(f"{type(self).__name__} does not define forward")
+
+    def measure(self, buffers: Buffers) -> dict[str, Tensor]:
+        """Return the frame numbers that need the whole frame, from whole frames.
+
+        A method that is called on crops or tiles must be given these numbers of the whole frame to give the
+        same result. Methods that look only at neighbourhoods return nothing.
+        """
+        return {}
+
+    def deploy(self) -> Denoiser:
+        """Return the form used for inference, equal to 1e-5; by default the module itself."""
+        return self
+
+    def check(self, buffers: Buffers) -> tuple[int, int, int]:
+        """Check names and shapes of the inputs and return (B, H, W).
+
+        Raises:
+            ValueError: Names the buffer, what was expected and what came.
+        """
+        missing = [name for name in self.inputs if name not in buffers]
+        if missing:
+            raise ValueError(
+                f"{type(self).__name__} needs the buffers {', '.join(self.inputs)}; "
+                f"missing: {', '.join(missing)}; given: {', '.join(buffers) or 'none'}"
+            )
+        sizes = buffers[self.inputs[0]].shape
+        batch, height, width = int(sizes[0]), int(sizes[-2]), int(sizes[-1])
+        for name in self.inputs:
+            tensor, channels = buffers[name], buffer(name).channels
+            expected = (batch, channels, height, width)
+            if not torch.jit.is_tracing() and tuple(tensor.shape) != expected:
+                raise ValueError(
+                    f"{type(self).__name__}: buffer {name!r} has shape {tuple(tensor.shape)}, "
+                    f"expected {expected} like {self.inputs[0]!r}"
+                )
+        return batch, height, width
+
+    def exposure(self, buffers: Buffers) -> Tensor:
+        """Return the exposure as (B, 1, 1, 1), 1 where the mapping has none."""
+        like = buffers[self.inputs[0]]
+        given = buffers.get("exposure")
+        if given is None:
+            return torch.ones((), dtype=like.dtype, device=like.device).reshape(1, 1, 1, 1)
+        return given.to(like.dtype).reshape(-1, 1, 1, 1)
+
+
+def select(denoiser: Denoiser, buffers: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the part of a batch that a denoiser reads: its inputs and the known frame numbers."""
+    names = (*denoiser.inputs, *(n for n in FRAME_NUMBERS if n in denoiser.frame_numbers))
+    return {name: buffers[name] for name in names if name in buffers}

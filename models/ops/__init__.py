@@ -1,0 +1,1 @@
+"""Functions without parameters; each states its formula and source."""

@@ -1,0 +1,1 @@
+"""Deployable artifacts: ONNX and TorchScript, with measured parity."""

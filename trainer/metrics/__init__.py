@@ -1,0 +1,1 @@
+"""Metrics; each name carries its definition."""
