@@ -1,1 +1,11 @@
-"""Denoisers: torch only, no files, no Lightning, no MLflow."""
+"""Denoisers: torch only, no files, no Lightning, no MLflow.
+
+`__all__` is the catalogue: exactly the denoisers, each one a class that keeps the contract of
+`models.denoiser.Denoiser`. The contract itself can be imported from here too.
+"""
+
+from models.denoiser import Denoised as Denoised
+from models.denoiser import Denoiser as Denoiser
+from models.wskp import WSKP
+
+__all__ = ["WSKP"]
