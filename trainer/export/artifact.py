@@ -1,0 +1,181 @@
+"""Exported artifacts as denoisers: what the contract declares, around ONNX Runtime or TorchScript."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from data.buffers import buffer
+from models.denoiser import Denoised
+from trainer.export.description import KEY, Description
+from trainer.export.entry import tracing
+from trainer.export.torchscript import EXTRA_FILE
+
+SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}
+"""File suffix of each format."""
+
+
+class Runtime(Protocol):
+    """Runs one artifact."""
+
+    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
+        """Return the color (B, 3, H, W)."""
+
+
+class Artifact:
+    """An exported denoiser that keeps the contract of `models.denoiser.Denoiser` for inference.
+
+    Attributes:
+        description: The metadata of the file.
+        inputs, frame_numbers, halo, multiple, temporal, per_sample: As declared by the denoiser.
+    """
+
+    def __init__(self, description: Description, runtime: Runtime, name: str) -> None:
+        self.description = description
+        self.name = name
+        self.inputs = description.inputs
+        self.frame_numbers = description.frame_numbers
+        self.halo = description.halo
+        self.multiple = description.multiple
+        self.temporal = description.temporal
+        self.per_sample = description.per_sample
+        self._runtime = runtime
+
+    def __call__(self, buffers: Mapping[str, Tensor]) -> Denoised:
+        """Denoise a batch, as `Denoiser.forward` does.
+
+        Raises:
+            ValueError: A buffer is missing or has another shape.
+        """
+        self.check(buffers)
+        known = (*self.inputs, *self.frame_numbers)
+        return Denoised(self._runtime({name: buffers[name] for name in known if name in buffers}))
+
+    def measure(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the frame numbers that need the whole frame, as the vocabulary defines them."""
+        if "depth_range" not in self.frame_numbers or "depth" not in buffers:
+            return {}
+        depth = buffers["depth"].flatten(1)
+        return {"depth_range": torch.stack((depth.amin(1), depth.amax(1)), 1)}
+
+    def deploy(self) -> Artifact:
+        """Return the artifact itself: it is the deployed form."""
+        return self
+
+    def eval(self) -> Artifact:
+        """Return the artifact itself: it has no training form."""
+        return self
+
+    def check(self, buffers: Mapping[str, Tensor]) -> tuple[int, int, int]:
+        """Check names and shapes of the inputs and return (B, H, W).
+
+        Raises:
+            ValueError: Names the buffer, what was expected and what came.
+        """
+        missing = [name for name in self.inputs if name not in buffers]
+        if missing:
+            raise ValueError(
+                f"{self.name} needs the buffers {', '.join(self.inputs)}; missing: {', '.join(missing)}; "
+                f"given: {', '.join(buffers) or 'none'}"
+            )
+        batch, _, height, width = buffers[self.inputs[0]].shape
+        for name in self.inputs:
+            expected = (batch, buffer(name).channels, height, width)
+            if tuple(buffers[name].shape) != expected:
+                found = tuple(buffers[name].shape)
+                raise ValueError(f"{self.name}: buffer {name!r} has shape {found}, expected {expected}")
+        return batch, height, width
+
+
+class _OnnxRuntime:
+    def __init__(self, source: str | bytes, device: str) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3  # it warns about every input that has a default
+        options.intra_op_num_threads = torch.get_num_threads()
+        wanted = ["CUDAExecutionProvider"] if device.startswith("cuda") else []
+        missing = [name for name in wanted if name not in onnxruntime.get_available_providers()]
+        if missing:
+            raise ValueError(
+                f"this onnxruntime has no {missing[0]}; install onnxruntime-gpu or use --device cpu"
+            )
+        self.session = onnxruntime.InferenceSession(source, options, [*wanted, "CPUExecutionProvider"])
+
+    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
+        arrays = {name: np.ascontiguousarray(v.detach().float().cpu().numpy()) for name, v in feed.items()}
+        return torch.from_numpy(self.session.run(["color"], arrays)[0])
+
+
+class _TorchScript:
+    def __init__(self, module: Any, device: str) -> None:
+        self.module = module
+        self.device = device
+
+    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
+        with torch.inference_mode():
+            return self.module({name: value.to(self.device) for name, value in feed.items()})
+
+
+def load_artifact(path: Path | str, device: str = "cpu") -> Artifact:
+    """Load an exported file; its content, not its suffix, says which format it has.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, of another kind, or was not exported by Penumbra.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    if zipfile.is_zipfile(path):
+        return open_torchscript(path.read_bytes(), str(path), device)
+    return open_onnx(str(path), str(path), device)
+
+
+def open_onnx(source: str | bytes, name: str, device: str = "cpu") -> Artifact:
+    """Open an ONNX file, or its content; `name` is for messages. Raises as `load_artifact` does."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as states
+
+    broken = (states.InvalidProtobuf, states.InvalidGraph, states.Fail, states.InvalidArgument,
+              states.NoSuchFile, states.NotImplemented)  # fmt: skip
+    try:
+        runtime = _OnnxRuntime(source, device)
+    except broken as error:
+        first = str(error).splitlines()[0][:200]
+        raise ValueError(
+            f"{name} is not an ONNX or TorchScript file, or is damaged ({first}); export the model again"
+        ) from error
+    text = runtime.session.get_modelmeta().custom_metadata_map.get(KEY)
+    return Artifact(_described(text, name), runtime, name)
+
+
+def open_torchscript(content: bytes, name: str, device: str = "cpu") -> Artifact:
+    """Open the content of a TorchScript archive; `name` is for messages. Raises as `load_artifact` does."""
+    extra = {EXTRA_FILE: ""}
+    try:
+        with tracing():
+            module = torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra)
+    except RuntimeError as error:
+        first = str(error).splitlines()[0][:200]
+        raise ValueError(f"{name} is not a TorchScript archive, or is damaged ({first})") from error
+    text = extra[EXTRA_FILE]
+    text = text.decode() if isinstance(text, bytes) else text
+    return Artifact(_described(text, name), _TorchScript(module.eval(), device), name)
+
+
+def _described(text: str | None, name: str) -> Description:
+    if not text:
+        raise ValueError(
+            f"{name} was not exported by Penumbra: its metadata has no {KEY!r}. Make it with `trainer export`"
+        )
+    try:
+        return Description.from_json(text)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error

@@ -1,0 +1,123 @@
+"""What an exported artifact says about itself: the contract of its denoiser and where it came from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from models.denoiser import Denoiser
+
+KEY = "penumbra"
+"""Name of the entry in an ONNX file's `metadata_props`; a TorchScript archive holds `penumbra.json`."""
+
+FORMAT_VERSION = 1
+DISTRIBUTION = "penumbra-denoise"
+DEFAULTS: dict[str, tuple[float, ...]] = {"exposure": (1.0,), "depth_range": (float("nan"), float("nan"))}
+"""Frame numbers of a caller that gives none; NaN means: measure it from these images."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the weights came from.
+
+    Attributes:
+        reference: What the user named: a path, an MLflow URI, a class.
+        class_path: Import path of the denoiser's class.
+        init_args: Its hyper-parameters, as plain values.
+        sha256: Checksum of the file, empty where there is none.
+    """
+
+    reference: str
+    class_path: str = ""
+    init_args: dict[str, Any] = field(default_factory=dict)
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Parity:
+    """Largest difference between an artifact and the eager module it was made from.
+
+    Attributes:
+        error: Largest relative difference over all sizes (`trainer.export.parity` defines it).
+        limit: Largest error with which an artifact is accepted.
+        sizes: (batch, height, width) of each comparison.
+        runtime: What ran the artifact, with its version.
+    """
+
+    error: float
+    limit: float
+    sizes: tuple[tuple[int, int, int], ...]
+    runtime: str
+
+
+@dataclass(frozen=True)
+class Description:
+    """Metadata of an artifact: all that tiling, `trainer denoise` and a reader of the file need to know."""
+
+    model: str
+    inputs: tuple[str, ...]
+    frame_numbers: tuple[str, ...]
+    halo: int
+    multiple: int
+    temporal: bool
+    per_sample: bool
+    source: Source
+    parity: Parity | None = None
+    format: str = "onnx"
+    version: int = FORMAT_VERSION
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Return the description as one JSON object."""
+        return json.dumps(asdict(self), default=str)
+
+    @classmethod
+    def from_json(cls, text: str) -> Description:
+        """Read what `to_json` wrote.
+
+        Raises:
+            ValueError: The text is no description, or one of a later version of the format.
+        """
+        try:
+            values = json.loads(text)
+            if values["version"] > FORMAT_VERSION:
+                raise ValueError(
+                    f"its metadata has version {values['version']}, known up to {FORMAT_VERSION}; "
+                    f"update {DISTRIBUTION}"
+                )
+            parity = values.pop("parity")
+            if parity is not None:
+                sizes = tuple((int(b), int(h), int(w)) for b, h, w in parity.pop("sizes"))
+                parity = Parity(sizes=sizes, **parity)
+            for name in ("inputs", "frame_numbers"):
+                values[name] = tuple(values[name])
+            return cls(source=Source(**values.pop("source")), parity=parity, **values)
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
+
+
+def describe(denoiser: Denoiser, format: str, source: Source | None) -> Description:
+    """Return the description of a denoiser that is about to be exported."""
+    cls = type(denoiser)
+    source = source or Source(reference="memory", class_path=f"{cls.__module__}.{cls.__qualname__}")
+    return Description(
+        model=cls.__name__,
+        inputs=tuple(denoiser.inputs),
+        frame_numbers=tuple(denoiser.frame_numbers),
+        halo=int(denoiser.halo),
+        multiple=int(denoiser.multiple),
+        temporal=bool(denoiser.temporal),
+        per_sample=bool(denoiser.per_sample),
+        source=source,
+        format=format,
+        versions={name: _version(name) for name in (DISTRIBUTION, "torch", "onnx", "onnxruntime")},
+    )
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "not installed"

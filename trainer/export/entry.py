@@ -1,0 +1,131 @@
+"""The function that is exported: buffers and frame numbers by name in, `color` out."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from data.buffers import buffer
+from models.denoiser import Denoiser
+from trainer.export.description import DEFAULTS
+
+
+class Entry(nn.Module):
+    """Calls a denoiser with tensors by name and returns its color.
+
+    A frame number that is NaN is measured from the images, so that whoever has the whole image may leave it
+    out and a tiler may give the number of the whole frame. Frame numbers have one row for all images or one
+    row per image.
+    """
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        super().__init__()
+        self.denoiser = denoiser
+        self.names = (*denoiser.inputs, *denoiser.frame_numbers)
+
+    def forward(self, buffers: dict[str, Tensor]) -> Tensor:
+        """Return the color (B, 3, H, W) of buffers (B, C, H, W) and frame numbers (1 or B, …)."""
+        known = {name: buffers[name] for name in self.names}
+        for name, measured in self.denoiser.measure(known).items():
+            if name in known:
+                known[name] = torch.where(torch.isnan(known[name]), measured, known[name])
+        return self.denoiser(known).color
+
+
+class Positional(nn.Module):
+    """The same with the tensors in the order of `Entry.names`, as a graph of an ONNX file needs."""
+
+    def __init__(self, entry: Entry) -> None:
+        super().__init__()
+        self.entry = entry
+
+    def forward(self, *tensors: Tensor) -> Tensor:
+        """Return the color (B, 3, H, W)."""
+        return self.entry(dict(zip(self.entry.names, tensors, strict=True)))
+
+
+def prepare(denoiser: Denoiser) -> Denoiser:
+    """Return a deployed copy in float32 on the CPU, ready to be traced; the original is left alone.
+
+    Raises:
+        ValueError: The denoiser cannot be exported, and why.
+    """
+    if denoiser.per_sample:
+        raise ValueError(
+            f"{type(denoiser).__name__} reads single samples; such models cannot be exported yet"
+        )
+    return copy.deepcopy(denoiser).deploy().eval().float().cpu().requires_grad_(False)
+
+
+def default(name: str) -> Tensor:
+    """Return the value (1,) or (1, n) of a frame number that nobody gave."""
+    value = torch.tensor(DEFAULTS[name], dtype=torch.float32)
+    return value if len(DEFAULTS[name]) == 1 else value[None]
+
+
+def example(denoiser: Denoiser, batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+    """Return made-up inputs with the ranges of renders: heavy-tailed radiance with fireflies up to 6e4 and
+    black pixels, unit normals, depths with misses."""
+    generator = torch.Generator().manual_seed(seed)
+    return {name: _image(name, (batch, height, width), generator) for name in denoiser.inputs}
+
+
+def _image(name: str, size: tuple[int, int, int], generator: torch.Generator) -> Tensor:
+    entry = buffer(name)
+    batch, height, width = size
+    shape = (batch, entry.channels, height, width)
+    uniform = torch.rand(shape, generator=generator)
+    pixel = torch.rand((batch, 1, height, width), generator=generator)
+    match entry.kind:
+        case "radiance":
+            noise = torch.exp(1.5 * torch.randn(shape, generator=generator) - 1)
+            noise = torch.where(pixel > 0.995, noise * 1000, noise).clamp(max=6e4)
+            return torch.where(pixel < 0.1, torch.zeros_like(noise), noise)
+        case "vector":
+            return nn.functional.normalize(2 * uniform - 1, dim=1)
+        case "distance":
+            return torch.where(pixel < 0.05, torch.zeros_like(uniform), 2 + 30 * uniform)
+        case "count":
+            return 1 + torch.floor(8 * uniform)
+        case "variance":
+            return uniform**4
+        case _:
+            return uniform
+
+
+def numbers(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return frame numbers unlike the defaults: a different exposure per image, a widened measured range."""
+    batch = next(iter(buffers.values())).shape[0]
+    given = {name: value * 1.25 for name, value in denoiser.measure(buffers).items()}
+    if "exposure" in denoiser.frame_numbers:
+        given["exposure"] = torch.linspace(0.3, 2.5, batch)
+    return {name: value for name, value in given.items() if name in denoiser.frame_numbers}
+
+
+@contextmanager
+def tracing() -> Iterator[list[str]]:
+    """Collect what the tracer doubts, and drop the deprecation of TorchScript and its ONNX exporter.
+
+    The yielded list receives the tracer's warnings: they matter only if parity fails, and say why. Every
+    other warning is passed on.
+    """
+    doubts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield doubts
+    for warning in caught:
+        if issubclass(warning.category, torch.jit.TracerWarning):
+            doubts.append(f"{warning.filename}:{warning.lineno}: {str(warning.message).split('.')[0]}")
+        elif not _known(warning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+
+
+def _known(warning: warnings.WarningMessage) -> bool:
+    text = str(warning.message)
+    known = ("torch.jit.", "legacy TorchScript-based ONNX export", "The feature will be removed")
+    return issubclass(warning.category, DeprecationWarning) and any(part in text for part in known)

@@ -1,0 +1,62 @@
+"""Export to ONNX.
+
+The graph's inputs carry the buffers' names, the output is `color`; batch, height and width are free. Frame
+numbers are inputs with a default value: an initializer of the same name, which ONNX lets the caller
+override. ONNX Runtime lists them under `get_overridable_initializers()`.
+
+PyTorch has two exporters. On a convolution, box-filter and softmax network like WSKP (torch 2.13, two CPU
+cores) the one that traces took 0.2 s and gave a file that runs with every batch and size; the one built on
+`torch.export` took 6.6 s and fixes the length of the frame numbers to that of the batch, so they cannot have
+a default. The first is therefore used, although PyTorch calls it legacy.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import onnx
+import torch
+
+from models.denoiser import Denoiser
+from trainer.export.description import KEY, Description
+from trainer.export.entry import Entry, Positional, default, example, tracing
+
+OPSET = 17
+"""ONNX operator set: the oldest one with every operator in use, which ONNX Runtime has since 1.12."""
+
+
+def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
+    """Return the ONNX file of a prepared denoiser, and what the tracer doubted."""
+    buffers = example(denoiser, 2, 48, 32)
+    given = {name: default(name) for name in denoiser.frame_numbers}
+    free = {0: "batch", 2: "height", 3: "width"}
+    axes = dict.fromkeys((*buffers, "color"), free) | {name: {0: "frames"} for name in given}
+    entry = Entry(denoiser).eval()
+    # Two rows: the tracer would otherwise see a batch of one and leave out broadcasts.
+    tensors = tuple(buffers.values()) + tuple(value.repeat_interleave(2, 0) for value in given.values())
+    with tracing() as doubts, torch.inference_mode(), tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.onnx"
+        torch.onnx.export(
+            Positional(entry), tensors, path, dynamo=False, opset_version=OPSET,
+            input_names=list(entry.names), output_names=["color"], dynamic_axes=axes,
+        )  # fmt: skip
+        model = onnx.load(path)
+    for name, value in given.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value.numpy(), name))
+    onnx.checker.check_model(model)
+    return model.SerializeToString(), doubts
+
+
+def describe_file(content: bytes, description: Description) -> bytes:
+    """Return the same ONNX file with this description in its metadata."""
+    model = onnx.load_model_from_string(content)
+    model.producer_name, model.producer_version = "Penumbra", description.versions["penumbra-denoise"]
+    model.doc_string = (
+        f"{description.model}: linear radiance (B, 3, H, W) from {', '.join(description.inputs)}. "
+        f"Optional: {', '.join(description.frame_numbers) or 'nothing'}."
+    )
+    del model.metadata_props[:]
+    model.metadata_props.add(key=KEY, value=replace(description, format="onnx").to_json())
+    return model.SerializeToString()

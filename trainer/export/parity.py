@@ -1,0 +1,72 @@
+"""Does an artifact compute what the module it was made from computes?
+
+The error of an image is the largest `|artifact - eager| / (|eager| + 0.01 m)`, m being the image's median
+`|eager|`, which keeps black pixels next to bright ones from dividing by nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from models.denoiser import Denoiser
+from trainer.export.artifact import Artifact
+from trainer.export.description import Parity
+from trainer.export.entry import example, numbers
+
+LIMIT = 1e-4
+SIZES = ((1, 17, 31), (2, 63, 50), (1, 128, 128), (2, 45, 80), (3, 16, 97))
+"""(batch, height, width): none is the size that was traced, most are odd."""
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Return the largest relative difference of two images (B, C, H, W); infinite where one is not finite."""
+    if found.shape != expected.shape:
+        raise ValueError(f"shape {tuple(found.shape)}, expected {tuple(expected.shape)}")
+    size = expected.abs().flatten(1)
+    floor = 0.01 * size.median(dim=1, keepdim=True).values + 1e-8
+    error = (found - expected).abs().flatten(1) / (size + floor)
+    return float(error.amax()) if bool(torch.isfinite(error).all()) else float("inf")
+
+
+@torch.inference_mode()
+def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: float = LIMIT) -> Parity:
+    """Compare an artifact with the eager, deployed, float32 module on `SIZES`.
+
+    Each size is run without frame numbers and with numbers unlike the defaults, on inputs with fireflies.
+
+    Raises:
+        ValueError: The artifact fails at a size or differs by more than `limit`; the message says where.
+    """
+    worst = 0.0
+    sizes = tuple((b, _round(h, denoiser.multiple), _round(w, denoiser.multiple)) for b, h, w in SIZES)
+    for seed, (batch, height, width) in enumerate(sizes):
+        plain = example(denoiser, batch, height, width, seed)
+        _compare_measured(artifact, denoiser, plain)
+        for buffers in (plain, plain | numbers(denoiser, plain)):
+            place = f"batch {batch}, {width}x{height}"
+            try:
+                error = relative_error(artifact(buffers).color, denoiser(buffers).color)
+            except Exception as failure:
+                raise ValueError(f"the exported file does not run at {place}: {failure}") from failure
+            if not error <= limit:
+                raise ValueError(f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}")
+            worst = max(worst, error)
+    return Parity(worst, limit, sizes, runtime)
+
+
+def _compare_measured(artifact: Artifact, denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> None:
+    expected = {k: v for k, v in denoiser.measure(buffers).items() if k in denoiser.frame_numbers}
+    found = artifact.measure(buffers)
+    for name, value in expected.items():
+        if name not in found or not torch.equal(found[name], value):
+            raise ValueError(
+                f"{type(denoiser).__name__} measures {name!r} in its own way, so that tiles of an exported "
+                "file would differ; follow the definition in data.buffers.FRAME_NUMBERS"
+            )
+
+
+def _round(size: int, multiple: int) -> int:
+    return -(-size // multiple) * multiple

@@ -1,0 +1,61 @@
+"""Export to TorchScript: a traced network in a thin scripted shell.
+
+The shell's `forward` takes the contract's mapping, a `Dict[str, Tensor]` in which frame numbers may be
+missing, and returns the color. Tracing alone could not express the defaults, and scripting alone would ask
+every network to be written in TorchScript's subset of Python.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Dict, cast  # noqa: UP035 - TorchScript reads these annotations
+
+import torch
+from torch import Tensor, nn
+
+from models.denoiser import Denoiser
+from trainer.export.description import Description
+from trainer.export.entry import Entry, default, example, tracing
+
+EXTRA_FILE = "penumbra.json"
+
+
+class Shell(nn.Module):
+    """Checks the names, fills in frame numbers that are missing, calls the traced network."""
+
+    def __init__(self, core: nn.Module, inputs: tuple[str, ...], defaults: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.core = core
+        self.inputs = list(inputs)
+        # TorchScript cannot infer the type of an empty dictionary.
+        self.defaults = cast(dict[str, Tensor], torch.jit.Attribute(defaults, Dict[str, Tensor]))  # noqa: UP006
+
+    def forward(self, buffers: Dict[str, Tensor]) -> Tensor:  # noqa: UP006
+        """Return the color (B, 3, H, W)."""
+        known: Dict[str, Tensor] = {}  # noqa: UP006
+        for name in self.inputs:
+            if name not in buffers:
+                raise ValueError("missing buffer " + name)
+            known[name] = buffers[name]
+        device = buffers[self.inputs[0]].device
+        for name, value in self.defaults.items():
+            known[name] = buffers[name] if name in buffers else value.to(device)
+        return self.core(known)
+
+
+def build(denoiser: Denoiser) -> tuple[torch.jit.ScriptModule, list[str]]:
+    """Return the scripted shell of a prepared denoiser, and what the tracer doubted."""
+    given = {name: default(name) for name in denoiser.frame_numbers}
+    buffers = example(denoiser, 2, 48, 32) | {name: v.repeat_interleave(2, 0) for name, v in given.items()}
+    with tracing() as doubts, torch.no_grad():
+        core = torch.jit.trace(Entry(denoiser).eval(), (buffers,), check_trace=False)
+        module = torch.jit.script(Shell(core, tuple(denoiser.inputs), given).eval())
+    return module, doubts
+
+
+def serialise(module: torch.jit.ScriptModule, description: Description) -> bytes:
+    """Return the archive with its description."""
+    stream = io.BytesIO()
+    with tracing():
+        torch.jit.save(module, stream, _extra_files={EXTRA_FILE: description.to_json()})
+    return stream.getvalue()
