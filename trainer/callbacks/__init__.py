@@ -1,1 +1,17 @@
 """Lightning callbacks."""
+
+from trainer.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint, LastCheckpoint
+from trainer.callbacks.exporting import ExportBest
+from trainer.callbacks.finite import FiniteGuard
+from trainer.callbacks.pictures import ValidationPictures
+from trainer.callbacks.progress import TrainingProgress
+
+__all__ = [
+    "AtomicCheckpointIO",
+    "BestCheckpoint",
+    "ExportBest",
+    "FiniteGuard",
+    "LastCheckpoint",
+    "TrainingProgress",
+    "ValidationPictures",
+]

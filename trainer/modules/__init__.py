@@ -1,1 +1,5 @@
 """LightningModules."""
+
+from trainer.modules.regression import Regression
+
+__all__ = ["Regression"]

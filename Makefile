@@ -1,0 +1,56 @@
+# Two commands do everything on a fresh machine: `make fit` and `make test`.
+PYTHON ?= python3.11
+VENV ?= .venv
+# A CPU build of PyTorch. For CUDA: make fit TORCH=torch==2.13.0 TORCH_INDEX=
+TORCH ?= torch==2.13.0+cpu
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+OUTPUT ?= runs/pictures
+
+BIN = $(VENV)/bin
+READY = $(VENV)/.ready
+DEV_READY = $(VENV)/.ready-dev
+
+.PHONY: fit test test-all lint format bench clean
+
+fit: $(READY)
+	$(BIN)/trainer fit --config wskp_bmfr.yaml
+	$(BIN)/trainer test --config wskp_bmfr.yaml
+	$(BIN)/trainer denoise --model best:wskp_bmfr sample:bmfr --split test --output $(OUTPUT) --png --force
+
+test: $(DEV_READY)
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: $(DEV_READY)
+	$(BIN)/python -m pytest
+
+lint: $(DEV_READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(DEV_READY)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(DEV_READY)
+	$(BIN)/python -m tests.benchmarks
+
+$(VENV)/.torch:
+	$(PYTHON) -m venv $(VENV)
+	@echo "Installing PyTorch ($(TORCH))"
+	$(BIN)/pip install --quiet "$(TORCH)" || $(BIN)/pip install --quiet "$(TORCH)" --index-url "$(TORCH_INDEX)"
+	@touch $@
+
+$(READY): $(VENV)/.torch pyproject.toml constraints.txt
+	@echo "Installing Penumbra"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(DEV_READY): $(READY)
+	@echo "Installing what tests and linters need"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) runs bench dist build .mypy_cache .ruff_cache .pytest_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,64 @@
+"""Exports the best weights of a run and registers them as a model version."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from trainer.tracking import MLflowTracking
+
+
+class ExportBest(Callback):
+    """At the end of `fit`: best checkpoint → ONNX and TorchScript, with parity, into the run.
+
+    An export that fails says why and leaves the run as it is; `trainer export` repeats it.
+
+    Args:
+        formats: What to write; any of `onnx`, `torchscript`.
+        register: Register the ONNX model as a version of the logger's `registered_model`.
+    """
+
+    def __init__(self, formats: tuple[str, ...] = ("onnx", "torchscript"), register: bool = True) -> None:
+        self.formats = formats
+        self.register = register
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Export on the first rank."""
+        logger = trainer.logger
+        if not trainer.is_global_zero or not isinstance(logger, MLflowTracking):
+            return
+        checkpoints = logger.folder / "checkpoints"
+        chosen = next((p for p in (checkpoints / "best.ckpt", checkpoints / "last.ckpt") if p.is_file()), None)
+        if chosen is None:
+            return
+        logger.log_file(chosen, "checkpoints")
+        try:
+            self._export(logger, chosen)
+        except (ValueError, OSError) as error:
+            logger.set_tags({"export.error": str(error)[:500]})
+            print(
+                f"The export failed: {error}\nThe checkpoint is {chosen}; repeat with "
+                f"`trainer export --model {chosen} --format onnx --output DIR`.",
+                file=sys.stderr,
+            )
+
+    def _export(self, logger: MLflowTracking, checkpoint: Path) -> None:
+        from trainer.export import SUFFIXES, Source, export
+        from trainer.export.register import log_and_register
+        from trainer.loading import load_model
+
+        net = load_model(str(checkpoint))
+        source = Source(str(checkpoint), f"{type(net).__module__}.{type(net).__name__}")
+        folder = logger.folder / "export"
+        for format in self.formats:
+            path = folder / f"{logger.registered_model or 'model'}{SUFFIXES[format]}"
+            parity = export(net, path, format, source=source, force=True)  # type: ignore[arg-type]
+            print(f"exported {path} (differs from eager by {parity.error:.1e})", file=sys.stderr)
+            logger.log_file(path, "export")
+            logger.set_tags({f"export.{format}.parity": f"{parity.error:.3e}"})
+            if format == "onnx" and self.register and logger.registered_model:
+                name = logger.registered_model
+                version = logger.call(lambda c, run, p=path, n=name: log_and_register(run, p, n, logger.uri))
+                print(f"registered models:/{name}/{version}", file=sys.stderr)

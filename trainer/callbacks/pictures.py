@@ -1,0 +1,79 @@
+"""Fixed validation crops as pictures in the run: noisy, accumulated, denoised, reference, error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from trainer.modules.regression import noisy_input
+from trainer.tracking import MLflowTracking
+
+
+class ValidationPictures(Callback):
+    """Log the first crops of every validation scene at chosen epochs.
+
+    Every crop is one strip at equal exposure, with the metrics below it and a false-colour error map.
+
+    Args:
+        every_n_epochs: Distance between two epochs that are pictured; the first and the last always are.
+        crops_per_scene: Number of crops of each scene.
+    """
+
+    def __init__(self, every_n_epochs: int = 5, crops_per_scene: int = 1) -> None:
+        self.every_n_epochs = every_n_epochs
+        self.crops_per_scene = crops_per_scene
+        self._seen: dict[str, int] = {}
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start with no crop pictured."""
+        self._seen = {}
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Picture the crops of this batch that are still wanted."""
+        logger = trainer.logger
+        if not trainer.is_global_zero or not isinstance(logger, MLflowTracking) or not self._due(trainer):
+            return
+        wanted = [
+            row for row, scene in enumerate(batch["scene"]) if self._seen.get(scene, 0) < self.crops_per_scene
+        ]
+        for row in wanted:
+            scene = batch["scene"][row]
+            number = self._seen.get(scene, 0)
+            if number >= self.crops_per_scene:
+                continue
+            self._seen[scene] = number + 1
+            picture = self._strip(pl_module, batch, row)
+            logger.log_picture(picture, key=f"validation/{scene}-{number}", step=trainer.global_step)
+
+    def _due(self, trainer: Trainer) -> bool:
+        if trainer.sanity_checking or trainer.state.fn != "fit":
+            return False
+        epoch, last = trainer.current_epoch, (trainer.max_epochs or 0) - 1
+        return epoch % self.every_n_epochs == 0 or epoch == last
+
+    @torch.no_grad()
+    def _strip(self, module: LightningModule, batch: dict[str, Any], row: int) -> Any:
+        from trainer.reports.pictures import comparison
+
+        one = {k: v[row : row + 1] for k, v in batch.items() if isinstance(v, torch.Tensor)}
+        images = {
+            "noisy": one.get("color"),
+            "accumulated": noisy_input(module.net, one) if module.net.temporal else None,  # type: ignore[union-attr]
+            "denoised": module(one).color,
+            "reference": one["reference"],
+        }
+        arrays = {
+            name: None if image is None else image[0].float().permute(1, 2, 0).cpu().numpy()
+            for name, image in images.items()
+        }
+        return comparison(**arrays, exposure=float(one["exposure"][0]))

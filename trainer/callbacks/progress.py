@@ -1,0 +1,185 @@
+"""What a person sees while training: rate, waiting, loss, validation and time left."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+
+class _Left(ProgressColumn):
+    """Time left of the whole training."""
+
+    def render(self, task: Task) -> Text:
+        left = task.fields.get("left")
+        return Text("" if left is None else f"{duration(left)} left", style="cyan")
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as a person says it: `48 s`, `7:05`, `2:10:00`."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, hours = whole // 60 % 60, whole // 3600
+    return f"{hours}:{minutes:02}:{whole % 60:02}" if hours else f"{minutes}:{whole % 60:02}"
+
+
+class TrainingProgress(ProgressBar):
+    """Progress of fit, validate and test: a live bar on a terminal, plain lines elsewhere.
+
+    Logs `throughput/patches_per_s` and `throughput/waiting` (share of the time since the last report that
+    was spent waiting for data) every `log_every_n_steps` steps.
+
+    Args:
+        plain_interval_s: Seconds between two plain lines.
+    """
+
+    def __init__(self, plain_interval_s: float = 15.0) -> None:
+        super().__init__()
+        self.plain_interval_s = plain_interval_s
+        self._enabled = True
+        self._bar: Progress | None = None
+        self._task: Any = None
+        self._printed = 0.0
+        self._started = 0.0
+        self._first_step = 0
+        self._mark = (0.0, 0, 0.0)  # time, patches, seconds waited at the last report
+        self._patches = 0
+        self._rate = 0.0
+        self._waiting = 0.0
+        self._loss: float | None = None
+        self._paused_s = 0.0
+
+    def disable(self) -> None:
+        """Show nothing (Lightning calls this on all ranks but the first)."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Show progress."""
+        self._enabled = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._started = self._printed = time.monotonic()
+        self._first_step = trainer.global_step
+        self._mark = (self._started, 0, waited(trainer))
+        self._patches, self._paused_s = 0, 0.0
+        if self._enabled and sys.stderr.isatty():
+            self._bar = Progress(
+                TextColumn("[bold]{task.description}"), BarColumn(bar_width=24),
+                TextColumn("{task.completed:.0f}/{task.total:.0f} steps"), TimeElapsedColumn(), _Left(),
+                TextColumn("{task.fields[numbers]}"),
+                console=Console(stderr=True), refresh_per_second=4,
+            )  # fmt: skip
+            self._task = self._bar.add_task(
+                "training", total=total_steps(trainer), completed=trainer.global_step, numbers="", left=None
+            )
+            self._bar.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Count patches, and report at intervals."""
+        self._patches += len(batch["scene"]) * trainer.world_size
+        step, every = trainer.global_step, trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if step % every == 0 or batch_idx + 1 == trainer.num_training_batches:
+            self._measure(trainer)
+            pl_module.log_dict(
+                {"throughput/patches_per_s": self._rate, "throughput/waiting": self._waiting},
+                rank_zero_only=True,
+            )
+        if outputs is not None and self._enabled and (self._bar is not None or step % every == 0):
+            self._loss = float(outputs["loss"] if isinstance(outputs, dict) else outputs)
+        self._show(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop the training clock: validation is no waiting."""
+        self._validation_began = time.monotonic()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the validation score of the epoch."""
+        pause = time.monotonic() - self._validation_began
+        self._paused_s += pause
+        self._mark = (self._mark[0] + pause, *self._mark[1:])
+        if self._enabled and not trainer.sanity_checking and trainer.state.fn == "fit":
+            self._line(f"epoch {trainer.current_epoch}: {self._scores(trainer)}")
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Close the bar."""
+        self._close()
+        if self._enabled:
+            self._line(f"trained {trainer.global_step} steps in {duration(time.monotonic() - self._started)}")
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Close the bar, so that the message stands below it."""
+        self._close()
+
+    def print(self, *args: Any, **kwargs: Any) -> None:
+        """Print above the bar."""
+        if self._bar is not None:
+            self._bar.console.print(*args)
+        elif self._enabled:
+            print(*args, file=sys.stderr)
+
+    def _measure(self, trainer: Trainer) -> None:
+        now, waiting = time.monotonic(), waited(trainer)
+        then, patches, waiting_then = self._mark
+        elapsed = max(now - then, 1e-9)
+        self._rate = (self._patches - patches) / elapsed
+        self._waiting = min(max((waiting - waiting_then) / elapsed, 0.0), 1.0)
+        self._mark = (now, self._patches, waiting)
+
+    def _numbers(self, trainer: Trainer) -> str:
+        parts = [f"{self._rate:.1f} patches/s", f"waiting {self._waiting:.1%}"]
+        if self._loss is not None:
+            parts.append(f"loss {self._loss:.4f}")
+        if "val/psnr_wskp" in trainer.callback_metrics:
+            parts.append(f"val {float(trainer.callback_metrics['val/psnr_wskp']):.2f} dB")
+        return " | ".join(parts)
+
+    def _scores(self, trainer: Trainer) -> str:
+        names = {"val/psnr_wskp": "PSNR {:.2f} dB", "val/ssim_wskp": "SSIM {:.4f}", "val/loss": "loss {:.4f}"}
+        have = trainer.callback_metrics
+        return "validation " + ", ".join(t.format(float(have[n])) for n, t in names.items() if n in have)
+
+    def _show(self, trainer: Trainer) -> None:
+        if not self._enabled:
+            return
+        now, step, total = time.monotonic(), trainer.global_step, total_steps(trainer)
+        done = max(step - self._first_step, 1)
+        left = (now - self._started) / done * max(total - step, 0)
+        if self._bar is not None:
+            self._bar.update(
+                self._task, completed=step, left=left, numbers=self._numbers(trainer),
+                description=f"epoch {trainer.current_epoch}",
+            )  # fmt: skip
+        elif now - self._printed > self.plain_interval_s:
+            self._printed = now
+            self._line(
+                f"epoch {trainer.current_epoch} step {step}/{total:.0f} | {self._numbers(trainer)} | "
+                f"{duration(left)} left"
+            )
+
+    def _line(self, text: str) -> None:
+        self.print(text)
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def total_steps(trainer: Trainer) -> float:
+    """Return the number of optimiser steps of the whole training."""
+    return float(trainer.estimated_stepping_batches)
+
+
+def waited(trainer: Trainer) -> float:
+    """Return the seconds that the training loader has made its caller wait, 0 where it does not count."""
+    return float(getattr(trainer.train_dataloader, "waited_s", 0.0))

@@ -1,0 +1,93 @@
+"""Records what a run was: resolved configuration, parameters, versions, git state, data."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.cli import SaveConfigCallback
+
+from trainer.tracking import MLflowTracking
+
+PACKAGES = ("penumbra-denoise", "torch", "lightning", "mlflow", "numpy", "torchmetrics", "jsonargparse",
+            "OpenEXR", "onnx", "onnxruntime")  # fmt: skip
+
+
+class RunRecorder(SaveConfigCallback):
+    """Writes `config.yaml` into the run's folder and describes the run in MLflow."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Record everything; called on the first rank only."""
+        logger = trainer.logger
+        if stage != "fit" or not isinstance(logger, MLflowTracking):
+            return
+        text = self.parser.dump(self.config, skip_none=False)
+        path = logger.folder / "config.yaml"
+        if not path.exists() or self.overwrite:
+            path.write_text(text)
+        logger.log_text(text, "config.yaml")
+        logger.log_params(flatten(self.config.as_dict()))
+        logger.log_text("\n".join(installed()) + "\n", "packages.txt")
+        manifest_hash = getattr(trainer.datamodule, "manifest_hash", None)  # type: ignore[attr-defined]
+        tags = {f"version.{name}": version for name, version in versions().items()}
+        tags |= git_state(Path.cwd())
+        tags |= {"data.manifest_hash": str(manifest_hash), "python": platform.python_version()}
+        tags["parameters"] = str(sum(p.numel() for p in pl_module.parameters() if p.requires_grad))
+        logger.set_tags(tags)
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a nested configuration as `a.b.c` → value, without empty branches and command options."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if key in ("config", "ckpt_path"):
+            continue
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{name}.")
+        elif isinstance(value, list) and any(isinstance(v, Mapping) for v in value):
+            flat[name] = ", ".join(str(v.get("class_path", v)) if isinstance(v, Mapping) else str(v)
+                                   for v in value)  # fmt: skip
+        elif value is not None:
+            flat[name] = value
+    return flat
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that results depend on."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def installed() -> list[str]:
+    """Return every installed distribution as `name==version`, sorted."""
+    return sorted({f"{d.metadata['Name']}=={d.version}" for d in metadata.distributions()}, key=str.lower)
+
+
+def git_state(folder: Path) -> dict[str, str]:
+    """Return commit and whether the tree is changed, of the project's checkout or of `folder`; {} without."""
+    for place in (Path(__file__).resolve().parent, folder):
+        try:
+            commit = _git(place, "rev-parse", "HEAD")
+            dirty = bool(_git(place, "status", "--porcelain", "--untracked-files=no"))
+        except (OSError, subprocess.SubprocessError):
+            continue
+        return {"git.commit": commit, "git.changed": str(dirty).lower()}
+    return {}
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True, timeout=20
+    )
+    return done.stdout.strip()

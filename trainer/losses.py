@@ -1,0 +1,59 @@
+"""Losses on linear radiance. Each computes in float32 whatever the precision of its inputs.
+
+The training modules call a loss with exposed radiance (radiance times the frame's exposure), so the
+constants below mean the same in every scene.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class SMAPE(nn.Module):
+    """Symmetric mean absolute percentage error, `mean |o - t| / (|o| + |t| + epsilon)`.
+
+    The form of WSKP (Fan et al. 2021), the layer paper and OIDN: the gradient flows through the
+    denominator. Range 0 to 1.
+
+    Args:
+        epsilon: Keeps black pixels finite.
+    """
+
+    def __init__(self, epsilon: float = 0.01) -> None:
+        super().__init__()
+        self.epsilon = epsilon
+
+    def forward(self, output: Tensor, target: Tensor) -> Tensor:
+        """Return the mean over all elements of (B, 3, H, W)."""
+        output, target = output.float(), target.float()
+        return ((output - target).abs() / (output.abs() + target.abs() + self.epsilon)).mean()
+
+
+class L1(nn.Module):
+    """Mean absolute error."""
+
+    def forward(self, output: Tensor, target: Tensor) -> Tensor:
+        """Return the mean over all elements of (B, 3, H, W)."""
+        return (output.float() - target.float()).abs().mean()
+
+
+class RelativeL2(nn.Module):
+    """Relative squared error, `mean (o - t)^2 / (t^2 + epsilon)`; Rousselle et al. 2011.
+
+    Args:
+        epsilon: Keeps black pixels finite.
+        symmetric: Divide by the square of the (detached) output instead of the target's, as
+            Lehtinen et al. 2018 do, which keeps fireflies in a noisy target from dominating.
+    """
+
+    def __init__(self, epsilon: float = 0.01, symmetric: bool = False) -> None:
+        super().__init__()
+        self.epsilon = epsilon
+        self.symmetric = symmetric
+
+    def forward(self, output: Tensor, target: Tensor) -> Tensor:
+        """Return the mean over all elements of (B, 3, H, W)."""
+        output, target = output.float(), target.float()
+        scale = output.detach() if self.symmetric else target
+        return (torch.square(output - target) / (torch.square(scale) + self.epsilon)).mean()

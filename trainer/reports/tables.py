@@ -1,0 +1,51 @@
+"""Tables of metrics on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from trainer.metrics.collection import HIGHER_IS_BETTER, METRICS
+
+FORMATS = {"psnr_wskp": "{:.3f} dB", "ssim_wskp": "{:.4f}", "ssim_wskp_range1": "{:.4f}",
+           "relmse_layer": "{:.4f}", "smape_wskp": "{:.4f}"}  # fmt: skip
+
+
+def scores_by_scene(logged: Mapping[str, Any], prefix: str) -> dict[str, dict[str, float]]:
+    """Return scene → metric → value from logged names `<prefix>/<metric>[/<scene>]`, the average last."""
+    table: dict[str, dict[str, float]] = {}
+    for key, value in logged.items():
+        parts = key.split("/", 2)
+        if parts[0] == prefix and len(parts) > 1 and parts[1] in METRICS:
+            table.setdefault(parts[2] if len(parts) == 3 else "average", {})[parts[1]] = float(value)
+    average = table.pop("average", None)
+    return {**dict(sorted(table.items())), **({"average": average} if average else {})}
+
+
+def scores_table(logged: Mapping[str, Any], prefix: str) -> Table:
+    """Return a table with one row per scene and method: the noisy input and the denoised frames."""
+    titles = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
+    table = Table(title=titles.get(prefix, prefix), title_justify="left", header_style="bold")
+    table.add_column("scene")
+    table.add_column("image")
+    for name, higher in HIGHER_IS_BETTER.items():
+        table.add_column(f"{name} {'↑' if higher else '↓'}", justify="right", no_wrap=True)
+    denoised = scores_by_scene(logged, prefix)
+    noisy = scores_by_scene(logged, "input") if prefix == "test" else {}
+    for scene, row in denoised.items():
+        for label, values in (("input", noisy.get(scene)), ("denoised", row)):
+            if values is not None:
+                cells = [FORMATS[name].format(values[name]) for name in METRICS]
+                table.add_row(scene, label, *cells, style="bold" if label == "denoised" else "dim")
+        table.add_section()
+    return table
+
+
+def print_scores(logged: Mapping[str, Any], prefix: str) -> None:
+    """Print the table of metrics per scene and averaged."""
+    Console().print(scores_table(logged, prefix))
+    print("Definitions: PSNR and SSIM on clamp(max(x, 0)^0.454545, 0, 1) of exposed radiance;")
+    print("ssim_wskp uses data range 2 like the published tables, ssim_wskp_range1 uses 1.")

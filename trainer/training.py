@@ -1,0 +1,204 @@
+"""`trainer fit`, `validate` and `test`: LightningCLI with our defaults, messages and resuming."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import logging
+import re
+import sys
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
+
+from models.denoiser import Denoiser
+from trainer import configs, runs
+from trainer.callbacks.recorder import RunRecorder
+
+TRACKING = "trainer.tracking.MLflowTracking"
+
+
+def run_training(verb: str, arguments: list[str]) -> int:
+    """Run one of the training verbs with command-line arguments; returns the exit code."""
+    quiet_libraries()
+    # LightningCLI reads sys.argv, and so do the processes that its DDP launcher starts.
+    sys.argv = [sys.argv[0], verb, *configs.resolve_arguments(arguments)]
+    cli = TrainingCLI()
+    if verb != "fit" and cli.trainer.is_global_zero:
+        from trainer.reports.tables import print_scores
+
+        print_scores(cli.trainer.callback_metrics, "val" if verb == "validate" else "test")
+    return 0
+
+
+def quiet_libraries() -> None:
+    """Silence messages that tell a user nothing; everything else stays."""
+    for name in ("lightning.pytorch", "lightning.fabric", "torch.onnx", "onnxscript"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message, category in (
+        (r".*LeafSpec.*", FutureWarning),  # lightning 2.6 on torch 2.13
+        (r"Attribute '.*' is an instance of `nn.Module`", UserWarning),  # the checkpoint holds its class path
+        (r".*does not have many workers.*", UserWarning),  # the loader's own choice
+        (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
+        (r".*is smaller than the logging interval.*", UserWarning),
+    ):
+        warnings.filterwarnings("ignore", message, category)
+
+
+class Parser(LightningArgumentParser):
+    """Argument parser whose errors name what was probably meant."""
+
+    def error(self, message: str, ex: Exception | None = None) -> None:  # type: ignore[override]
+        """Raise instead of printing the usage, which has hundreds of lines here.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise configs.UsageError(explain(message, self.known_names())) from ex
+
+    def known_names(self) -> set[str]:
+        """Return every option name and every argument of the classes that can be configured."""
+        names = {key for key in self.get_defaults(skip_validation=True).keys()}
+        names |= {part for key in names for part in key.split(".")}
+        return names | class_arguments()
+
+
+def class_arguments() -> set[str]:
+    """Return constructor arguments of our modules, networks, losses and callbacks."""
+    import data
+    import models
+    import trainer.callbacks
+    import trainer.losses
+    import trainer.modules
+    from trainer.tracking import MLflowTracking
+
+    classes: list[Any] = [data.Shards, MLflowTracking]
+    for module in (models, trainer.callbacks, trainer.losses, trainer.modules):
+        classes += [value for _, value in inspect.getmembers(module, inspect.isclass)]
+    return {name for cls in classes for name in inspect.signature(cls).parameters}
+
+
+def explain(message: str, known: Iterable[str]) -> str:
+    """Return jsonargparse's message in short, with the nearest known name where one was misspelt."""
+    lines = [line.strip(" -\n") for line in message.splitlines() if line.strip()]
+    text = " ".join(dict.fromkeys(lines))
+    wrong = re.search(r"(?:Unrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text)
+    if wrong is None:
+        return text
+    word = wrong.group(1)
+    known = sorted(set(known))
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    if not near:
+        leaf = difflib.get_close_matches(word.rsplit(".", 1)[-1], known, n=1, cutoff=0.6)
+        near = [f"{word.rpartition('.')[0]}.{leaf[0]}".lstrip(".")] if leaf else []
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"unknown option {word!r}{hint} ({text[:300]})" if hint else text
+
+
+def net_inputs(net: Denoiser) -> tuple[str, ...]:
+    """Return the buffers that the data module must deliver."""
+    return net.inputs
+
+
+def net_temporal(net: Denoiser) -> bool:
+    """Return whether the network expects accumulated input."""
+    return net.temporal
+
+
+class TrainingCLI(LightningCLI):
+    """LightningCLI with shipped defaults, `--ckpt_path last|best`, and continuing the same MLflow run."""
+
+    def __init__(self, args: ArgsType = None) -> None:
+        defaults = [str(configs.folder() / configs.DEFAULTS)]
+        kwargs: dict[str, Any] = {verb: {"default_config_files": defaults} for verb in self.subcommands()}
+        super().__init__(
+            LightningModule,
+            LightningDataModule,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            save_config_callback=RunRecorder,
+            save_config_kwargs={"save_to_log_dir": False},
+            parser_class=Parser,
+            parser_kwargs=kwargs,
+            seed_everything_default=1,
+            auto_configure_optimizers=False,
+            args=args,
+        )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Return the verbs that are Lightning's."""
+        verbs = LightningCLI.subcommands()
+        return {verb: verbs[verb] for verb in ("fit", "validate", "test")}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Let the data module deliver what the network reads."""
+        net = "model.init_args.net"
+        parser.link_arguments(net, "data.init_args.buffers", compute_fn=net_inputs, apply_on="instantiate")
+        parser.link_arguments(net, "data.init_args.temporal", compute_fn=net_temporal, apply_on="instantiate")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
+        """Parse, then find the checkpoint that is meant and the run that it belongs to."""
+        super().parse_arguments(parser, args)
+        config = self.config[self.config.subcommand]
+        if self.config.subcommand != "fit":
+            config.verbose = False
+            config.ckpt_path = config.ckpt_path or "best"
+        logger = config.trainer.logger
+        tracked = getattr(logger, "class_path", None) == TRACKING
+        if config.ckpt_path:
+            root = Path(logger.init_args.root if tracked else "runs")
+            experiment = logger.init_args.experiment if tracked else "penumbra"
+            config.ckpt_path = str(runs.find_checkpoint(config.ckpt_path, root, experiment))
+            folder = runs.folder_of_checkpoint(Path(config.ckpt_path))
+            if tracked and folder is not None:
+                logger.init_args.resume_from = str(folder)
+            elif self.config.subcommand != "fit":
+                config.trainer.logger = False
+        if self.config.subcommand != "fit":
+            keep = ("TrainingProgress",)
+            config.trainer.callbacks = [
+                c for c in config.trainer.callbacks or [] if c.class_path.endswith(keep)
+            ]
+
+    def _parse_ckpt_path(self) -> None:
+        """Compare the checkpoint's network with the configured one.
+
+        Lightning would silently replace the configuration by the checkpoint's.
+
+        Raises:
+            ValueError: The checkpoint is damaged or holds another network.
+        """
+        config = self.config[self.config.subcommand]
+        if config.ckpt_path:
+            check_checkpoint(Path(config.ckpt_path), config.model.init_args.net)
+
+
+def check_checkpoint(path: Path, net: Any) -> None:
+    """Raise a ValueError unless the checkpoint can be read and holds the configured network."""
+    import pickle
+
+    import torch
+
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        saved = checkpoint["hyper_parameters"]["net"]
+    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, OSError) as error:
+        raise ValueError(f"{path} cannot be read as a checkpoint: {str(error).splitlines()[0]}") from None
+    except (KeyError, TypeError):
+        raise ValueError(f"{path} is not a checkpoint of `trainer fit`") from None
+    wanted = net.as_dict()
+    if _described(saved) != _described(wanted):
+        raise ValueError(
+            f"{path} holds {_described(saved)}, but the configuration asks for {_described(wanted)}; "
+            "give the configuration that it was trained with"
+        )
+
+
+def _described(net: dict[str, Any]) -> str:
+    arguments = {**(net.get("init_args") or {})}
+    return f"{net['class_path']}({', '.join(f'{k}={v}' for k, v in sorted(arguments.items()))})"
