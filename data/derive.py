@@ -1,0 +1,205 @@
+"""Buffers computed from others, each in one place: albedo, irradiance, colour, depth, motion, exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from data import camera as cameras
+from data.camera import Camera, DepthKind
+from data.frame import Frame, Image
+
+ALBEDO_FLOOR = 0.01
+"""Smallest effective albedo per channel. Division by it raises radiance at most a hundredfold, which keeps
+irradiance of darker surfaces within half precision; being multiplied back, it changes no result."""
+
+EXPOSURE_KEY = 0.18
+"""Grey that `automatic_exposure` maps the mean log luminance to."""
+
+
+def effective_albedo(diffuse: Image, specular: Image | None = None) -> Image:
+    """Return what radiance is divided by, (H, W, 3) in [0.01, 1].
+
+    The sum of diffuse and specular reflectance clipped to at most 1, so that metals, mirrors and glass keep
+    their texture; 1 where all channels are 0 and nothing is known (emitters, background, black materials);
+    then at least `ALBEDO_FLOOR` in each channel.
+
+    Args:
+        diffuse: Diffuse reflectance (H, W, 3).
+        specular: Specular reflectance at normal incidence, where the frame has it.
+    """
+    total = diffuse if specular is None else diffuse + specular
+    unknown = (total <= 0).all(axis=-1, keepdims=True)
+    return np.where(unknown, np.float32(1), np.clip(total, ALBEDO_FLOOR, 1)).astype(np.float32)
+
+
+def demodulate(color: Image, albedo: Image) -> Image:
+    """Return irradiance, `color / albedo` (H, W, 3).
+
+    Raises:
+        ValueError: Some albedo is not positive, so multiplying back would lose radiance.
+    """
+    if not (albedo > 0).all():
+        raise ValueError("albedo has values <= 0, which cannot be divided by; use effective_albedo")
+    return (color / albedo).astype(np.float32)
+
+
+def remodulate(irradiance: Image, albedo: Image) -> Image:
+    """Return radiance, `irradiance * albedo` (H, W, 3): the inverse of `demodulate` to float32 rounding."""
+    return (irradiance * albedo).astype(np.float32)
+
+
+def luminance(color: Image) -> Image:
+    """Return the Rec. 709 luminance (H, W) of linear RGB, with OIDN's weights."""
+    return np.asarray(color @ np.array([0.212671, 0.715160, 0.072169], np.float32), np.float32)
+
+
+def automatic_exposure(color: Image) -> float:
+    """Return the exposure that OIDN would use: 0.18 / 2^mean(log2 L).
+
+    L are the mean luminances of bins of at most 16x16 pixels, of which those above 1e-8 count. An image
+    without any (all black) gets 1, the exposure that changes nothing.
+
+    Source: Open Image Denoise, autoexposure.
+    """
+    light = luminance(color).astype(np.float64)
+    height, width = light.shape
+    rows = np.arange(-(-height // 16)) * height // -(-height // 16)
+    columns = np.arange(-(-width // 16)) * width // -(-width // 16)
+    sums = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
+    heights = np.diff(np.append(rows, height))[:, None]
+    widths = np.diff(np.append(columns, width))[None, :]
+    bins = sums / (heights * widths)
+    lit = bins[bins > 1e-8]
+    return float(EXPOSURE_KEY / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
+
+
+def derive(
+    frame: Frame,
+    names: Iterable[str],
+    *,
+    depth_kind: DepthKind = "euclidean",
+    previous: Camera | None = None,
+) -> Frame:
+    """Return the frame with the named buffers added where they are absent.
+
+    albedo from diffuse_albedo and specular_albedo; irradiance = color / albedo; color = irradiance * albedo,
+    or the mean of color_a and color_b; depth from position and camera; motion from position and both cameras;
+    specular = color - diffuse; hit from depth; history 1 for frames that are not accumulated.
+    `notes["derived"]` of the result records each with its rule.
+
+    Args:
+        frame: The frame, left as it is.
+        names: Buffers that are wanted; those already there are not touched.
+        depth_kind: What depth means in this data set.
+        previous: Camera of the preceding frame, for motion.
+
+    Raises:
+        ValueError: A buffer is absent and what it would be derived from is too; the message names both.
+    """
+    result = frame.with_buffers()
+    result.notes["derived"] = dict(frame.notes.get("derived", {}))
+    context = _Context(result, depth_kind, previous)
+    for name in names:
+        context.need(name)
+    return result
+
+
+class _Context:
+    """One call of `derive`: the growing frame and the parameters of its rules."""
+
+    def __init__(self, frame: Frame, depth_kind: DepthKind, previous: Camera | None) -> None:
+        self.frame, self.depth_kind, self.previous = frame, depth_kind, previous
+        self.rules: dict[str, Callable[[], tuple[Image, str]]] = {
+            "albedo": self._albedo,
+            "irradiance": self._irradiance,
+            "color": self._color,
+            "depth": self._depth,
+            "motion": self._motion,
+            "specular": self._specular,
+            "hit": self._hit,
+            "history": self._history,
+        }
+
+    def need(self, name: str) -> Image:
+        buffers = self.frame.buffers
+        if name not in buffers:
+            if name not in self.rules:
+                self.frame.require(name)
+            array, rule = self.rules[name]()
+            buffers[name] = np.ascontiguousarray(array, np.float32)
+            self.frame.notes["derived"][name] = rule
+        return buffers[name]
+
+    def _fail(self, name: str, needed: str) -> ValueError:
+        return ValueError(
+            f"{self.frame.label}: missing buffer {name!r}, and {needed} to derive it from is missing too; "
+            f"it has {', '.join(self.frame.buffers)}"
+        )
+
+    def _albedo(self) -> tuple[Image, str]:
+        diffuse = self.frame.buffers.get("diffuse_albedo")
+        specular = self.frame.buffers.get("specular_albedo")
+        if diffuse is None:
+            raise self._fail("albedo", "diffuse_albedo (and specular_albedo)")
+        names = "diffuse_albedo" if specular is None else "diffuse_albedo + specular_albedo"
+        return effective_albedo(diffuse, specular), f"{names}, 1 where 0, at least {ALBEDO_FLOOR}"
+
+    def _irradiance(self) -> tuple[Image, str]:
+        if not {"color", "color_a"} & self.frame.buffers.keys():
+            raise self._fail("irradiance", "color")
+        return demodulate(self.need("color"), self.need("albedo")), "color / albedo"
+
+    def _color(self) -> tuple[Image, str]:
+        buffers = self.frame.buffers
+        if "color_a" in buffers and "color_b" in buffers:
+            return np.float32(0.5) * (buffers["color_a"] + buffers["color_b"]), "mean of color_a and color_b"
+        if "irradiance" not in buffers:
+            raise self._fail("color", "irradiance and albedo, or color_a and color_b,")
+        return remodulate(buffers["irradiance"], self.need("albedo")), "irradiance * albedo"
+
+    def _depth(self) -> tuple[Image, str]:
+        position, camera = self.frame.buffers.get("position"), self.frame.camera
+        if position is None or camera is None:
+            raise self._fail("depth", "position" if position is None else "the camera")
+        depth = cameras.depth(camera, position, self.depth_kind)
+        depth = np.where(_no_hit(self.frame), np.float32(0), np.maximum(depth, 0))
+        rule = (
+            "w of the projected position"
+            if self.depth_kind == "z"
+            else "distance of position from the camera"
+        )
+        return depth, rule
+
+    def _motion(self) -> tuple[Image, str]:
+        position, camera = self.frame.buffers.get("position"), self.frame.camera
+        if position is None or camera is None or self.previous is None:
+            raise self._fail(
+                "motion", "position" if position is None else "the camera of this or the last frame"
+            )
+        motion = cameras.motion(position, camera, self.previous)
+        return np.where(_no_hit(self.frame), np.float32(0), motion), "position and both cameras"
+
+    def _specular(self) -> tuple[Image, str]:
+        if "diffuse" not in self.frame.buffers:
+            raise self._fail("specular", "diffuse")
+        return np.maximum(
+            self.need("color") - self.frame.buffers["diffuse"], 0
+        ), "color - diffuse, at least 0"
+
+    def _hit(self) -> tuple[Image, str]:
+        return (self.need("depth") > 0).astype(np.float32), "depth > 0"
+
+    def _history(self) -> tuple[Image, str]:
+        if self.frame.accumulated:
+            raise self._fail("history", "the count of accumulated frames")
+        return np.ones((self.frame.height, self.frame.width, 1), np.float32), "1, not accumulated"
+
+
+def _no_hit(frame: Frame) -> np.ndarray:
+    """Return (H, W, 1): position is exactly 0, and so is the normal where the frame has one."""
+    nothing = (frame.buffers["position"] == 0).all(-1, keepdims=True)
+    if "normal" in frame.buffers:
+        nothing &= (frame.buffers["normal"] == 0).all(-1, keepdims=True)
+    return np.asarray(nothing)

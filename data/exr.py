@@ -1,0 +1,271 @@
+"""Frames as EXR files: which channel is which buffer, header attributes, repairs and warnings.
+
+Our own files name channels `<buffer>.<letter>` with the words of `data.buffers` and carry scene, index,
+camera, exposure and samples per pixel as header attributes, so that one file is self-contained. Foreign
+files are understood where their names are close enough (see `KNOWN_NAMINGS`).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.buffers import BUFFERS, buffer
+from data.camera import Camera
+from data.exr_image import HALF_MAX as HALF_MAX
+from data.exr_image import ExrImage as ExrImage
+from data.exr_image import read_exr as read_exr
+from data.exr_image import write_exr as write_exr
+from data.frame import Frame, Image
+from data.repair import repair
+
+KNOWN_NAMINGS = (
+    "<buffer>.R/.G/.B, .X/.Y/.Z or .Z with the buffers color, irradiance, albedo, diffuse_albedo, "
+    "specular_albedo, normal, depth, position, motion, reference …; the same with A, B or Variance after the "
+    "buffer (colorA.R, colorVariance.R); plain R, G, B in a file named after its buffer "
+    "(color0.exr, albedo0.exr, shading_normal0.exr, world_position0.exr, reference0.exr)"
+)
+
+_MARK = "penumbra"
+_LETTERS = {1: ("Z", "Y", "V", "R", "X", "A"), 2: ("XY", "RG", "UV"), 3: ("RGB", "XYZ")}
+_STEMS = {
+    "albedo": "albedo",
+    "color": "color",
+    "irradiance": "irradiance",
+    "reference": "reference",
+    "shading_normal": "normal",
+    "normal": "normal",
+    "world_position": "position",
+    "position": "position",
+    "depth": "depth",
+}
+
+
+class RadianceWarning(UserWarning):
+    """A radiance buffer looks as if it came from an 8-bit or tone-mapped image."""
+
+
+def read_frame(path: str | Path, only: str | None = None) -> Frame:
+    """Read a frame from one EXR file.
+
+    Values that are not finite are replaced by each buffer's policy and counted in `notes["repaired"]`; pixels
+    outside the data window become `no_hit`. `notes["channels"]` says which channels became which buffer,
+    `notes["precision"]` how they were stored, and `notes["ignored"]` lists channels without a meaning here.
+
+    Args:
+        path: The file. Without our header attributes, scene and index come from its folder and name.
+        only: The buffer that a file with plain R, G, B holds; taken from the file's name where None.
+
+    Raises:
+        OSError: The file cannot be opened.
+        ValueError: It cannot be read as a frame: damaged, no EXR, unknown or incomplete channel names.
+
+    Warns:
+        RadianceWarning: Radiance that looks 8-bit or tone-mapped.
+    """
+    path = Path(path)
+    image = read_exr(path)
+    groups, ignored = _groups(image, only)
+    buffers, outside = {}, {}
+    for name, channels in groups.items():
+        buffers[name] = np.stack([image.channels[c] for c in channels], -1)
+        hidden = image.outside.get(channels[0])
+        if hidden is not None:
+            buffers[name][hidden] = buffer(name).no_hit
+            outside[name] = int(hidden.sum())
+    buffers, repaired = repair(buffers)
+    frame = _described(path, image, buffers)
+    frame.notes["channels"] = groups
+    frame.notes["precision"] = {n: _precision(image, channels) for n, channels in groups.items()}
+    for key, value in (("repaired", repaired), ("ignored", ignored), ("outside_data_window", outside)):
+        if value:
+            frame.notes[key] = value
+    for name, array in buffers.items():
+        _warn_unless_radiance(path, name, array)
+    return frame
+
+
+def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = None) -> dict[str, str]:
+    """Write a frame as one EXR file in our naming, whole or not at all.
+
+    Half precision where the vocabulary allows it and no value exceeds 65504, float32 otherwise.
+
+    Args:
+        frame: What to write, with scene, index, camera, exposure and spp in header attributes.
+        path: Target.
+        only: Names of the buffers to write, all of the frame where None.
+
+    Returns:
+        Buffer → `half` or `float`, as written.
+
+    Raises:
+        ValueError: A named buffer is missing, or a buffer holds NaN or infinities.
+        OSError: The file cannot be written; nothing is left behind.
+    """
+    names = list(frame.buffers if only is None else only)
+    frame.require(*names)
+    channels: dict[str, NDArray[Any]] = {}
+    precision = {}
+    for name in names:
+        entry, array = buffer(name), frame.buffers[name]
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"{frame.label}: buffer {name!r} holds NaN or Inf; repair it before writing {path}"
+            )
+        half = entry.half and float(np.abs(array).max(initial=0)) <= HALF_MAX
+        precision[name] = "half" if half else "float"
+        for i, letter in enumerate(entry.letters):
+            channels[f"{name}.{letter}"] = array[..., i].astype(np.float16 if half else np.float32)
+    write_exr(path, channels, _attributes(frame))
+    return precision
+
+
+def _attributes(frame: Frame) -> dict[str, Any]:
+    numbers = {"exposure": frame.exposure, "spp": frame.spp}
+    kept = {k: v for k, v in frame.notes.items() if k not in ("channels", "precision", "ignored")}
+    return {
+        _MARK: "1",
+        f"{_MARK}.scene": frame.scene,
+        f"{_MARK}.index": str(frame.index),
+        f"{_MARK}.accumulated": json.dumps(frame.accumulated),
+        **{f"{_MARK}.{k}": repr(v) for k, v in numbers.items() if v is not None},
+        **({f"{_MARK}.camera": json.dumps(frame.camera.to_json())} if frame.camera else {}),
+        **({f"{_MARK}.notes": json.dumps(kept)} if kept else {}),
+    }
+
+
+def _described(path: Path, image: ExrImage, buffers: dict[str, Image]) -> Frame:
+    number = re.search(r"(\d+)(?=\D*$)", path.stem)
+    header = {
+        k.removeprefix(f"{_MARK}."): v for k, v in image.attributes.items() if k.startswith(f"{_MARK}.")
+    }
+    try:
+        return Frame(
+            buffers,
+            scene=header.get("scene", path.resolve().parent.name),
+            index=int(header.get("index") or (number.group(1) if number else 0)),
+            camera=Camera.from_json(json.loads(header["camera"])) if "camera" in header else None,
+            exposure=float(header["exposure"]) if "exposure" in header else None,
+            spp=int(header["spp"]) if "spp" in header else None,
+            accumulated=bool(json.loads(header.get("accumulated", "false"))),
+            notes=dict(json.loads(header.get("notes", "{}"))),
+        )
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: cannot understand the file's header or buffers: {error}") from error
+
+
+def _groups(image: ExrImage, only: str | None) -> tuple[dict[str, list[str]], list[str]]:
+    """Return buffer → channels in order, and the channels that mean nothing here."""
+    layers: dict[str, dict[str, str]] = {}
+    for channel in image.channels:
+        layer, _, letter = channel.rpartition(".")
+        layers.setdefault(layer, {})[letter.upper()] = channel
+    groups: dict[str, list[str]] = {}
+    ignored: list[str] = []
+    for layer, letters in layers.items():
+        name = _name(image, layer, layers, only)
+        channels = None if name is None else _ordered(image.path, name, letters)
+        if name is None or channels is None:
+            ignored += letters.values()
+        elif name in groups:
+            raise ValueError(f"{image.path}: both {groups[name]} and {channels} name the buffer {name!r}")
+        else:
+            groups[name] = channels
+            ignored += [c for c in letters.values() if c not in channels]
+    if not groups:
+        raise ValueError(
+            f"{image.path}: unknown channel naming: {', '.join(sorted(image.channels))}. "
+            f"Known: {KNOWN_NAMINGS}"
+        )
+    return groups, sorted(ignored)
+
+
+def _name(image: ExrImage, layer: str, layers: Mapping[str, Any], only: str | None) -> str | None:
+    if not layer:
+        return only or _by_file_name(image.path, layers)
+    if _MARK in image.attributes:
+        return layer if layer in BUFFERS else None
+    name = re.sub(r"(?<=[a-z])(A|B)$", lambda m: f"_{m.group(1).lower()}", layer)
+    name = re.sub(r"(?<=[a-z])Variance$", "_variance", name)
+    base, _, suffix = name.partition("_") if name.endswith(("_a", "_b", "_variance")) else (name, "", "")
+    if base == "albedo" and _is_reflectance(image, layers):
+        base = "diffuse_albedo"
+    if base == "specular" and {"albedo", "roughness"} <= layers.keys():
+        base = "specular_albedo"
+    name = f"{base}_{suffix}" if suffix else base
+    return name if name in BUFFERS else None
+
+
+def _is_reflectance(image: ExrImage, layers: Mapping[str, Mapping[str, str]]) -> bool:
+    """Tell a renderer's albedo, 0 on lamps and mirrors, from what irradiance was divided by."""
+    if "irradiance" in layers or "albedo" not in layers:
+        return False
+    if {"specular", "roughness"} <= layers.keys():
+        return True
+    return any((image.channels[c] <= 0).any() for c in layers["albedo"].values())
+
+
+def _by_file_name(path: Path, layers: Mapping[str, Any]) -> str:
+    if len(layers) > 1:
+        return "color"
+    return _STEMS.get(re.sub(r"[\d._-]+$", "", path.stem).lower(), "color")
+
+
+def _ordered(path: Path, name: str, letters: Mapping[str, str]) -> list[str] | None:
+    count = buffer(name).channels
+    for order in _LETTERS[count]:
+        if all(letter in letters for letter in order):
+            return [letters[letter] for letter in order]
+    if name.endswith("_variance") or (count == 3 and not {"R", "G", "B", "X"} & letters.keys()):
+        return None
+    if count == 1 and letters:
+        return [next(iter(letters.values()))]
+    found = ", ".join(sorted(letters.values()))
+    raise ValueError(f"{path}: buffer {name!r} needs the channels {buffer(name).letters}, found only {found}")
+
+
+def _precision(image: ExrImage, channels: list[str]) -> str:
+    kinds = {image.precision[c] for c in channels}
+    return kinds.pop() if len(kinds) == 1 else "mixed"
+
+
+def _warn_unless_radiance(path: Path, name: str, array: Image) -> None:
+    if buffer(name).kind != "radiance" or array.size == 0 or float(array.max()) > 1:
+        return
+    reason = looks_encoded(array)
+    if reason:
+        warnings.warn(
+            f"{path}: buffer {name!r} {reason}; linear radiance is expected, render to half or float EXR",
+            RadianceWarning,
+            stacklevel=3,
+        )
+
+
+def looks_encoded(array: Image) -> str | None:
+    """Return why an image looks 8-bit or clipped by a tone map, None for plausible radiance.
+
+    8-bit: at least 64 values that are not 0, at most 256 different ones, all of them k/255 directly, or after
+    sRGB or gamma 2.2 encoding. Clipped: nothing above 1 and at least one value in two hundred exactly 1.
+    """
+    values = array[array > 0]
+    if values.size < 64 or float(values.max()) > 1:
+        return None
+    levels = np.unique(values)
+    if 8 <= levels.size <= 256:
+        srgb = np.where(levels <= 0.0031308, 12.92 * levels, 1.055 * levels ** (1 / 2.4) - 0.055)
+        for code in (levels, srgb, levels ** (1 / 2.2)):
+            scaled = code * 255
+            if (np.abs(scaled - np.round(scaled)) < 0.07).all():
+                return f"has only {levels.size} levels, those of an 8-bit image"
+    if levels.size >= 64 and float((values == 1).mean()) >= 0.005:
+        return (
+            f"is clipped at 1 ({100 * float((values == 1).mean()):.1f} % of its values), as after a tone map"
+        )
+    return None

@@ -1,0 +1,217 @@
+"""OpenEXR files as plain channels: what the library returns, checked, composed, written whole or not.
+
+Traps of the library (OpenEXR 3.3 to 3.5, its Python module) that this file deals with: channels X, Y, Z are
+merged unless asked not to; a file with damaged pixels raises nothing, prints a line and has fewer parts; the
+dictionary given for writing is modified; pixels outside the data window are the reader's business.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+HALF_MAX = 65504.0
+"""Largest finite half precision number; larger values are stored in float32."""
+
+_MAGIC = b"\x76\x2f\x31\x01"
+_DEEP = 0x800
+_EIGHT_BIT = {
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"II*\x00": "TIFF",
+    b"MM\x00*": "TIFF",
+    b"GIF8": "GIF",
+    b"BM": "BMP",
+    b"RIFF": "WebP",
+}
+
+
+@dataclass
+class ExrImage:
+    """The channels of one file, in its display window.
+
+    Attributes:
+        path: The file.
+        channels: Full channel name → float32 (H, W); 0 outside the data window. In files of several parts a
+            channel without a layer is prefixed by the name of its part.
+        precision: Channel name → `half`, `float` or `uint`, as stored.
+        outside: Channel name → bool (H, W), True outside the data window; only channels that do not fill it.
+        attributes: Header attributes of the first part.
+        parts: Names of the parts, empty strings where a part has none.
+    """
+
+    path: Path
+    channels: dict[str, NDArray[np.float32]]
+    precision: dict[str, str]
+    attributes: dict[str, Any]
+    parts: list[str]
+    outside: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        height, width = next(iter(self.channels.values())).shape
+        return height, width
+
+
+def read_exr(path: str | Path) -> ExrImage:
+    """Read every channel of an EXR file.
+
+    Half and float channels become float32, every part is read, and each data window is composed into the
+    display window (cropped where it is larger, 0 where it is smaller).
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: The file cannot be opened.
+        ValueError: It is empty, no EXR, truncated, damaged, deep, subsampled, or an 8-bit image format.
+    """
+    path = Path(path)
+    _check_header(path)
+    try:
+        # The library prints a warning to standard output where it should raise.
+        with contextlib.redirect_stdout(io.StringIO()):
+            with OpenEXR.File(str(path), separate_channels=True, header_only=True) as head:
+                expected = len(head.parts)
+            with OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file:
+                parts = [
+                    (part.name() or "", dict(file.header(i)), _pixels(part, path))
+                    for i, part in enumerate(file.parts)
+                ]
+    except RuntimeError as error:
+        raise ValueError(
+            f"{path}: damaged or truncated EXR file ({error}); copy or render it again"
+        ) from error
+    if len(parts) < max(expected, 1) or any(array.size == 0 for _, _, p in parts for array in p.values()):
+        raise ValueError(f"{path}: truncated or damaged EXR file: pixels missing; copy or render it again")
+    if not any(pixels for _, _, pixels in parts):
+        raise ValueError(f"{path}: EXR file without channels")
+    return _compose(path, parts)
+
+
+def write_exr(
+    path: str | Path,
+    channels: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a ZIP-compressed scan-line EXR file, whole or not at all.
+
+    Args:
+        path: Target; its folder is created.
+        channels: Channel name → float16 or float32 (H, W); the type chooses half or float. A float16 array
+            must hold no value that overflowed.
+        attributes: Header attributes: strings, integers, floats.
+
+    Raises:
+        ValueError: Another type, or arrays of different size.
+        OSError: No permission, full disk …; nothing is left behind.
+    """
+    path = Path(path)
+    if not channels:
+        raise ValueError(f"{path}: nothing to write, no channels given")
+    shapes = {name: array.shape for name, array in channels.items()}
+    if len(set(shapes.values())) > 1 or any(len(s) != 2 for s in shapes.values()):
+        raise ValueError(f"{path}: channels must be (H, W) of one size, got {shapes}")
+    for name, array in channels.items():
+        if array.dtype not in (np.float16, np.float32):
+            raise ValueError(f"{path}: channel {name!r} is {array.dtype}, expected float16 or float32")
+    header = {
+        **(attributes or {}),
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        pixels = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+        with OpenEXR.File(header, pixels, num_threads=0) as file:
+            file.write(str(temporary))
+        os.replace(temporary, path)
+    except (RuntimeError, OSError) as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        reason = getattr(error, "strerror", None) or str(error)
+        raise OSError(f"{path}: cannot write the file: {reason}; check permissions and free space") from error
+
+
+def _check_header(path: Path) -> None:
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, expected an EXR file")
+    with path.open("rb") as file:
+        start = file.read(8)
+    if not start:
+        raise ValueError(f"{path}: the file is empty")
+    for magic, name in _EIGHT_BIT.items():
+        if start.startswith(magic):
+            raise ValueError(
+                f"{path} is a {name} file: 8-bit image, radiance needed; render to OpenEXR (half or float)"
+            )
+    if start[:4] != _MAGIC:
+        raise ValueError(f"{path}: not an OpenEXR file")
+    if len(start) < 8:
+        raise ValueError(f"{path}: truncated EXR file")
+    if int.from_bytes(start[4:8], "little") & _DEEP:
+        raise ValueError(f"{path}: deep EXR images are not supported; flatten it first")
+
+
+def _pixels(part: Any, path: Path) -> dict[str, NDArray[Any]]:
+    pixels = {}
+    for name, channel in part.channels.items():
+        if channel.xSampling != 1 or channel.ySampling != 1:
+            raise ValueError(f"{path}: channel {name!r} is subsampled, expected one value per pixel")
+        pixels[name] = np.asarray(channel.pixels)
+    return pixels
+
+
+def _compose(path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArray[Any]]]]) -> ExrImage:
+    several = len(parts) > 1
+    image = ExrImage(path, {}, {}, _attributes(parts[0][1]), [name for name, _, _ in parts])
+    sizes = set()
+    for part, header, pixels in parts:
+        (left, top), (right, bottom) = (np.asarray(v).tolist() for v in header["displayWindow"])
+        sizes.add((bottom - top + 1, right - left + 1))
+        for name, array in pixels.items():
+            full = f"{part}.{name}" if several and part and "." not in name else name
+            if full in image.channels:
+                full = f"{part}.{name}"
+            origin = np.asarray(header["dataWindow"][0]) - (left, top)
+            placed, outside = _place(array, int(origin[0]), int(origin[1]), max(sizes))
+            image.channels[full] = placed
+            image.precision[full] = {"float16": "half", "float32": "float"}.get(array.dtype.name, "uint")
+            if outside is not None:
+                image.outside[full] = outside
+    if len(sizes) > 1:
+        raise ValueError(f"{path}: parts of different size: {sorted(sizes)} (height, width)")
+    return image
+
+
+def _place(
+    array: NDArray[Any], x: int, y: int, size: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    height, width = size
+    # Half precision files may hold infinities that float32 cannot tell from overflow: kept, repaired later.
+    pixels = array.astype(np.float32)
+    if (x, y) == (0, 0) and array.shape == size:
+        return pixels, None
+    placed = np.zeros(size, np.float32)
+    outside = np.ones(size, bool)
+    rows = slice(max(y, 0), min(y + array.shape[0], height))
+    columns = slice(max(x, 0), min(x + array.shape[1], width))
+    if rows.start < rows.stop and columns.start < columns.stop:
+        source = (slice(rows.start - y, rows.stop - y), slice(columns.start - x, columns.stop - x))
+        placed[rows, columns] = pixels[source]
+        outside[rows, columns] = False
+    return placed, outside if outside.any() else None
+
+
+def _attributes(header: Mapping[str, Any]) -> dict[str, Any]:
+    skipped = {"channels", "compression", "type", "lineOrder", "dataWindow", "displayWindow"}
+    return {name: value for name, value in header.items() if name not in skipped}
