@@ -10,13 +10,6 @@ from torch import Tensor
 def box_sum(maps: Tensor, size: int) -> Tensor:
     """Sum a size x size window around every pixel; pixels outside the image count as 0.
 
-    Two 1-D sums, each by doubling: windows of 1, 2, 4, 8 … pixels come from adding shifted copies, and the
-    binary digits of `size` say which of them make up the window. That takes at most 2 log2(size) additions
-    per pixel and direction (5 for 13), so running time hardly depends on the size. Only numbers of the
-    window itself are ever added: for non-negative maps the relative error stays below
-    2 log2(size**2) * eps whatever the dynamic range of the image, which an integral image, a difference of
-    two large sums, cannot give in float32.
-
     Args:
         maps: (B, C, H, W), floating point.
         size: Odd window size.
@@ -24,25 +17,46 @@ def box_sum(maps: Tensor, size: int) -> Tensor:
     Returns:
         (B, C, H, W). The operation is its own adjoint.
     """
+    return box_sum_valid(F.pad(maps, [size // 2] * 4), size)
+
+
+def box_sum_valid(maps: Tensor, size: int) -> Tensor:
+    """Sum every size x size window that lies inside the image.
+
+    Two 1-D sums, each by doubling: sums of 1, 2, 4, 8 … neighbours come from adding shifted copies, and the
+    binary digits of `size` say which of them make up the window. That takes at most 2 log2(size) additions
+    per pixel and direction (5 for 13), so running time hardly depends on the size. Only numbers of the
+    window itself are ever added: for non-negative maps the relative error stays near eps whatever the
+    dynamic range of the image, which an integral image, a difference of two large sums, cannot give.
+
+    Args:
+        maps: (B, C, H, W), floating point.
+        size: Window size.
+
+    Returns:
+        (B, C, H - size + 1, W - size + 1).
+    """
     return _sum_along(_sum_along(maps, size, -1), size, -2)
 
 
 def _sum_along(maps: Tensor, size: int, dim: int) -> Tensor:
-    radius, length = size // 2, maps.shape[dim]
-    padding = (radius, radius) if dim == -1 else (0, 0, radius, radius)
-    run, width, offset = F.pad(maps, padding), 1, 0
-    total: Tensor | None = None
+    length = maps.shape[dim] - size + 1
+    run, width, offset = maps, 1, 0
+    parts: list[Tensor] = []
     while True:
         if size & width:
-            part = run.narrow(dim, offset, length)
-            total = part if total is None else total + part
+            parts.append(run.narrow(dim, offset, length))
             offset += width
         if 2 * width > size:
             break
         rest = run.shape[dim] - width
         run = run.narrow(dim, 0, rest) + run.narrow(dim, width, rest)
         width *= 2
-    assert total is not None
+    if len(parts) == 1:
+        return parts[0]
+    total = parts[0] + parts[1]
+    for part in parts[2:]:
+        total += part
     return total
 
 

@@ -8,38 +8,28 @@ With E = exp(log-importance), a window of k x k pixels around p, cut at the imag
 with k x k weights per pixel, and is the reference. `reconstruct` uses that R_k is a ratio of two window
 sums: no weight is ever stored and the running time hardly depends on k.
 
-Numbers: exp overflows above 88 and one common shift underflows whole windows to 0 / 0 as soon as a map
-spans more than about 90, while a shift per window cannot be shared by window sums. So log-importance is cut
-into bands of 64, measured down from the largest value of each map. Within a band exp stays in e**-32 …
-e**32; every band gets window sums of its own, and a pixel combines them relative to the highest band that
-its window holds. That equals the softmax for every finite input. A map that spans less than 64, the
-common case, has one band and costs nothing extra; bands without pixels are skipped.
+Numbers: `models.ops.window` sums exp for maps of any range; images are processed in chunks of samples and
+of rows that fit the processor's cache, which also keeps the extra memory small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from models.ops.boxes import box_mean_padded, box_sum, exporting
+from models.ops.window import log_maps, to_band, window_sums
 
-SPAN = 64.0
-"""Width of a band of log-importance: e**(+-32) times radiance up to 1e9 and 169 pixels stays in float32."""
+EXPORTED_SPAN = 128.0
+"""Range of log-importance below the maximum that an exported graph distinguishes: see `reconstruct`."""
 
-EXPORTED_BANDS = 2
-"""Bands of an exported graph, which cannot choose: see `reconstruct`."""
-
-
-class Window(NamedTuple):
-    """Window sums of one map: numerators and denominator (B, 4, H, W), relative to exp(-SPAN * band)."""
-
-    sums: Tensor
-    band: Tensor | None
+_CHUNK = 1 << 16
+"""Pixels processed at once on a CPU: four channels of them fit a core's second-level cache."""
 
 
 def reconstruct(
@@ -51,10 +41,10 @@ def reconstruct(
     Runs in float32, or float64 for float64 input, also under mixed precision. Differentiable once, with
     respect to all three tensors; the backward pass recomputes the window sums instead of keeping them.
 
-    In a graph recorded by torch.jit.trace or torch.export the number of bands is fixed to
-    `EXPORTED_BANDS`: log-importance more than 128 below the largest value of its map is raised to that
-    level (such pixels weigh under 1e-55 of the brightest; only windows that hold nothing else notice: they
-    average equally), so that the result is always finite.
+    A graph recorded by torch.jit.trace or torch.export cannot choose the number of bands. It raises
+    log-importance more than `EXPORTED_SPAN` below the largest value of its map to that level: a window that
+    holds higher pixels weighs such pixels under 1e-55 of the map's largest either way, a window that holds
+    nothing else averages them equally, and the result is always finite.
 
     Args:
         irradiance: (B, 3, H, W), linear.
@@ -68,7 +58,8 @@ def reconstruct(
     Raises:
         ValueError: Number of maps and kernels differ, or a size is even.
     """
-    _check(log_importance, fusion_logits, kernel_sizes)
+    if not exporting():
+        _check(log_importance, fusion_logits, kernel_sizes)
     irradiance, log_importance = _wide(irradiance), _wide(log_importance)
     fusion = torch.softmax(_wide(fusion_logits), 1)
     if exporting():
@@ -117,77 +108,32 @@ def _wide(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype == torch.float64 else tensor.float()
 
 
-def _tops(log_importance: Tensor) -> Tensor:
-    """Return the reference level of every map (B, K, 1, 1): its maximum, rounded up.
-
-    Whole numbers keep `top - SPAN * band` free of rounding for maps of any height.
-    """
-    return log_importance.detach().amax((-2, -1), keepdim=True).ceil()
-
-
-def _bands(log_importance: Tensor, tops: Tensor) -> list[list[int]]:
-    """Return for each of the K maps the bands, counted down from the top, that hold at least one pixel."""
-    depth = tops - log_importance.detach().amin((-2, -1), keepdim=True)
-    deepest = depth.amax((0, 2, 3)).tolist()
-    result = []
-    for index, deep in enumerate(deepest):
-        if deep < SPAN:
-            result.append([0])
-            continue
-        level = ((tops[:, index] - log_importance.detach()[:, index]) / SPAN).floor()
-        result.append([int(b) for b in torch.unique(level).tolist()])
-    return result
-
-
-def _energy(log_map: Tensor, top: Tensor, band: int, alone: bool) -> Tensor:
-    """Return exp(log-importance) of the pixels of one band, relative to its centre, 0 elsewhere."""
-    shifted = log_map - (top - SPAN * (band + 0.5))
-    if alone:
-        return shifted.exp_()
-    inside = ((top - log_map) / SPAN).floor_() == band
-    return torch.where(inside, shifted.clamp_(-SPAN, SPAN).exp_(), 0.0)
-
-
-def _weighted(energy: Tensor, irradiance: Tensor) -> Tensor:
-    batch, _, height, width = irradiance.shape
-    stacked = irradiance.new_empty(batch, 4, height, width)
-    torch.mul(irradiance, energy, out=stacked[:, :3])
-    stacked[:, 3:] = energy
-    return stacked
-
-
-def _window(irradiance: Tensor, log_map: Tensor, top: Tensor, bands: list[int], size: int) -> Window:
-    """Return the window sums of one map."""
-    first, *lower = bands
-    energy = _energy(log_map, top, first, alone=not lower)
-    sums = box_sum(_weighted(energy, irradiance), size)
-    if not lower:
-        return Window(sums, None)
-    highest = torch.full_like(log_map, first)
-    for band in lower:
-        energy = _energy(log_map, top, band, alone=False)
-        below = box_sum(_weighted(energy, irradiance), size)
-        empty = sums[:, 3:] == 0
-        sums = sums + below * torch.where(empty, 1.0, torch.exp(SPAN * (highest - band)))
-        highest = torch.where(empty, float(band), highest)
-    return Window(sums, highest)
+def _chunks(batch: int, pixels: int, like: Tensor) -> Iterator[slice]:
+    """Return groups of samples that are processed at once; devices other than the CPU take them all."""
+    step = max(1, _CHUNK // pixels) if like.device.type == "cpu" else batch
+    return (slice(first, min(batch, first + step)) for first in range(0, batch, step))
 
 
 def _forward(
     irradiance: Tensor, log_importance: Tensor, fusion: Tensor, kernel_sizes: Sequence[int]
 ) -> Tensor:
-    """Stream over the kernels: one set of window sums is alive at a time."""
-    tops = _tops(log_importance)
+    """Stream over samples, rows and kernels: one small set of window sums is alive at a time."""
+    batch, _, height, width = irradiance.shape
     total = torch.zeros_like(irradiance)
-    for index, (size, bands) in enumerate(zip(kernel_sizes, _bands(log_importance, tops), strict=True)):
-        one = slice(index, index + 1)
-        sums = _window(irradiance, log_importance[:, one], tops[:, one], bands, size).sums
-        total.addcmul_(sums[:, :3], fusion[:, one] / sums[:, 3:])
+    for some in _chunks(batch, height * width, irradiance):
+        noisy, maps = irradiance[some], log_maps(log_importance[some])
+        rows = max(16, _CHUNK // (noisy.shape[0] * width)) if irradiance.device.type == "cpu" else height
+        for start in range(0, height, rows):
+            stop = min(height, start + rows)
+            part, shares = total[some, :, start:stop], fusion[some, :, start:stop]
+            for index, (size, log_map) in enumerate(zip(kernel_sizes, maps, strict=True)):
+                sums = window_sums(noisy, log_map, size, start, stop).sums
+                part.addcmul_(sums[:, :3], shares[:, index : index + 1] / sums[:, 3:])
     return total
 
 
 class _Reconstruct(torch.autograd.Function):
-    """`_forward` with a backward pass that keeps only its inputs.
+    """`_forward` with a backward pass that keeps only the inputs.
 
     A window is symmetric, so the adjoint of a window sum B is B. With D = B(E), h = a g / D for the
     incoming gradient g and fusion weight a, summed over colour channels c:
@@ -198,61 +144,53 @@ class _Reconstruct(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: FunctionCtx, irradiance: Tensor, log_importance: Tensor, fusion: Tensor, sizes: tuple[int, ...]
+        ctx: Any, irradiance: Tensor, log_importance: Tensor, fusion: Tensor, sizes: tuple[int, ...]
     ) -> Tensor:
         ctx.save_for_backward(irradiance, log_importance, fusion)
-        ctx.sizes = sizes  # type: ignore[attr-defined]
+        ctx.sizes = sizes
         return _forward(irradiance, log_importance, fusion, sizes)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[no-untyped-def]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         irradiance, log_importance, fusion = ctx.saved_tensors
-        tops = _tops(log_importance)
+        batch, _, height, width = irradiance.shape
         d_irradiance = torch.zeros_like(irradiance) if ctx.needs_input_grad[0] else None
-        d_log, d_fusion = torch.empty_like(log_importance), torch.empty_like(fusion)
-        for index, (size, bands) in enumerate(zip(ctx.sizes, _bands(log_importance, tops), strict=True)):
-            one = slice(index, index + 1)
-            log_map, top = log_importance[:, one], tops[:, one]
-            sums, highest = _window(irradiance, log_map, top, bands, size)
-            inverse = sums[:, 3:].reciprocal()
-            filtered = sums[:, :3] * inverse
-            d_fusion[:, one] = (gradient * filtered).sum(1, keepdim=True)
-            adjoint = torch.cat([gradient, d_fusion[:, one]], 1) * (fusion[:, one] * inverse)
-            d_log[:, one] = 0
-            for band in bands:
-                energy = _energy(log_map, top, band, alone=highest is None)
-                spread = box_sum(_to_band(adjoint, highest, band), size)
-                pull = (irradiance * spread[:, :3]).sum(1, keepdim=True) - spread[:, 3:]
-                d_log[:, one] += energy * pull
-                if d_irradiance is not None:
-                    d_irradiance.addcmul_(energy.expand_as(irradiance), spread[:, :3])
+        d_log, d_fusion = torch.zeros_like(log_importance), torch.empty_like(fusion)
+        for some in _chunks(batch, height * width, irradiance):
+            noisy, maps = irradiance[some], log_maps(log_importance[some])
+            d_noisy = None if d_irradiance is None else d_irradiance[some]
+            for index, (size, log_map) in enumerate(zip(ctx.sizes, maps, strict=True)):
+                one = slice(index, index + 1)
+                sums, highest = window_sums(noisy, log_map, size, 0, height)
+                inverse = sums[:, 3:].reciprocal()
+                sums[:, :3].mul_(inverse).mul_(gradient[some])
+                torch.sum(sums[:, :3], 1, keepdim=True, out=d_fusion[some, one])
+                adjoint = torch.cat([gradient[some], d_fusion[some, one]], 1)
+                adjoint.mul_(inverse.mul_(fusion[some, one]))
+                for band in log_map.bands:
+                    energy = log_map.energy(band, slice(0, height))
+                    spread = box_sum(to_band(adjoint, highest, band), size).mul_(energy)
+                    if d_noisy is not None:
+                        d_noisy += spread[:, :3]
+                    spread[:, :3].mul_(noisy)
+                    d_log[some, one] += spread[:, :3].sum(1, keepdim=True).sub_(spread[:, 3:])
         return d_irradiance, d_log, d_fusion, None
-
-
-def _to_band(adjoint: Tensor, highest: Tensor | None, band: int) -> Tensor:
-    """Scale 1 / D from the highest band of each window to `band`; 0 where the window holds no such pixel."""
-    if highest is None:
-        return adjoint
-    scale = torch.exp((SPAN * (highest - band)).clamp_max(0.0))
-    return adjoint * torch.where(highest <= band, scale, 0.0)
 
 
 def _reconstruct_exported(
     irradiance: Tensor, log_importance: Tensor, fusion: Tensor, kernel_sizes: Sequence[int]
 ) -> Tensor:
-    """The same without branches on data and writes in place, for graphs that other runtimes execute."""
-    top = log_importance.amax((-2, -1), keepdim=True)
-    depth = (top - log_importance).clamp(max=SPAN * EXPORTED_BANDS)
-    upper = depth < SPAN
-    high = torch.where(upper, torch.exp(SPAN / 2 - depth), 0.0)
-    low = torch.where(upper, 0.0, torch.exp(SPAN * 1.5 - depth))
+    """The same without branches on data and writes in place, for graphs that other runtimes execute.
+
+    Without a backward pass one band of 128 fits float32: e**60 for the largest importance times radiance
+    up to 1e9 and e**-68 for the smallest times radiance down to 1e-7.
+    """
+    depth = log_importance.amax((-2, -1), keepdim=True) - log_importance
+    energy = torch.exp(60.0 - depth.clamp(max=EXPORTED_SPAN))
     total = torch.zeros_like(irradiance)
     for index, size in enumerate(kernel_sizes):
         one = slice(index, index + 1)
-        above = box_mean_padded(torch.cat([irradiance * high[:, one], high[:, one]], 1), size)
-        below = box_mean_padded(torch.cat([irradiance * low[:, one], low[:, one]], 1), size)
-        scale = torch.where(above[:, 3:] > 0, float(torch.exp(torch.tensor(-SPAN))), 1.0)
-        sums = above + below * scale
+        sums = box_mean_padded(torch.cat([irradiance * energy[:, one], energy[:, one]], 1), size)
         total = total + fusion[:, one] * (sums[:, :3] / sums[:, 3:])
     return total
