@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
@@ -68,11 +68,11 @@ def default(name: str) -> Tensor:
     return value if len(DEFAULTS[name]) == 1 else value[None]
 
 
-def example(denoiser: Denoiser, batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+def example(inputs: Iterable[str], batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
     """Return made-up inputs with the ranges of renders: heavy-tailed radiance with fireflies up to 6e4 and
     black pixels, unit normals, depths with misses."""
     generator = torch.Generator().manual_seed(seed)
-    return {name: _image(name, (batch, height, width), generator) for name in denoiser.inputs}
+    return {name: _image(name, (batch, height, width), generator) for name in inputs}
 
 
 def _image(name: str, size: tuple[int, int, int], generator: torch.Generator) -> Tensor:

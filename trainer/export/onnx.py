@@ -29,7 +29,7 @@ OPSET = 17
 
 def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
     """Return the ONNX file of a prepared denoiser, and what the tracer doubted."""
-    buffers = example(denoiser, 2, 48, 32)
+    buffers = example(denoiser.inputs, 2, 48, 32)
     given = {name: default(name) for name in denoiser.frame_numbers}
     free = {0: "batch", 2: "height", 3: "width"}
     axes = dict.fromkeys((*buffers, "color"), free) | {name: {0: "frames"} for name in given}

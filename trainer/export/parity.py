@@ -43,7 +43,7 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
     worst = 0.0
     sizes = tuple((b, _round(h, denoiser.multiple), _round(w, denoiser.multiple)) for b, h, w in SIZES)
     for seed, (batch, height, width) in enumerate(sizes):
-        plain = example(denoiser, batch, height, width, seed)
+        plain = example(denoiser.inputs, batch, height, width, seed)
         _compare_measured(artifact, denoiser, plain)
         for buffers in (plain, plain | numbers(denoiser, plain)):
             place = f"batch {batch}, {width}x{height}"

@@ -46,7 +46,9 @@ class Shell(nn.Module):
 def build(denoiser: Denoiser) -> tuple[torch.jit.ScriptModule, list[str]]:
     """Return the scripted shell of a prepared denoiser, and what the tracer doubted."""
     given = {name: default(name) for name in denoiser.frame_numbers}
-    buffers = example(denoiser, 2, 48, 32) | {name: v.repeat_interleave(2, 0) for name, v in given.items()}
+    buffers = example(denoiser.inputs, 2, 48, 32) | {
+        name: v.repeat_interleave(2, 0) for name, v in given.items()
+    }
     with tracing() as doubts, torch.no_grad():
         core = torch.jit.trace(Entry(denoiser).eval(), (buffers,), check_trace=False)
         module = torch.jit.script(Shell(core, tuple(denoiser.inputs), given).eval())

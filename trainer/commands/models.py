@@ -1,0 +1,119 @@
+"""`trainer models`: list the denoisers and the registered models."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from typing import Any
+
+HELP = "list denoisers and registered models"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.add_argument(
+        "--tracking-uri",
+        metavar="URI",
+        help="MLflow store to list (default: MLFLOW_TRACKING_URI, or runs/mlflow.db below this directory)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print both lists; returns the exit code.
+
+    Raises:
+        ValueError: A store was named and cannot be read.
+    """
+    from rich.console import Console
+
+    import models
+    from trainer.loading import model_store
+
+    console = Console()
+    console.print(denoiser_table())
+    for name in models.__all__:
+        console.print(f"models.{name}: {reference(getattr(models, name))}", highlight=False)
+    try:
+        store = model_store(args.tracking_uri)
+    except ValueError as error:
+        console.print(f"No registered models: {error}", highlight=False)
+        return 0
+    console.print(registered_table(store))
+    return 0
+
+
+def denoiser_table() -> Any:
+    """Return a table with a row for every denoiser of `models.__all__`, built with its defaults."""
+    from rich.table import Table
+
+    import models
+
+    table = Table(title="Denoisers", title_justify="left")
+    for title in ("class", "inputs", "parameters", "deployed", "halo", "temporal"):
+        right = title in ("parameters", "deployed", "halo")
+        table.add_column(title, justify="right" if right else "left", overflow="fold")
+    for name in models.__all__:
+        cls = getattr(models, name)
+        denoiser = cls()
+        counts = [sum(p.numel() for p in net.parameters()) for net in (denoiser, denoiser.deploy())]
+        table.add_row(
+            f"models.{name}",
+            ", ".join(denoiser.inputs),
+            *(f"{count:,}" if count else "none" for count in counts),
+            str(denoiser.halo),
+            "yes" if denoiser.temporal else "no",
+        )
+    return table
+
+
+def reference(cls: type) -> str:
+    """Return the paper of a denoiser.
+
+    That is the paragraph of its module's docstring with a DOI, else the first line of its own docstring.
+    """
+    module = inspect.getmodule(cls)
+    for paragraph in (inspect.getdoc(module) or "").split("\n\n"):
+        if "doi:" in paragraph:
+            return " ".join(paragraph.split())
+    return (inspect.getdoc(cls) or "").split("\n", 1)[0]
+
+
+def registered_table(store: str) -> Any:
+    """Return a table with a row for every registered model version of a store.
+
+    Raises:
+        ValueError: The store cannot be read.
+    """
+    from rich.table import Table
+
+    from trainer.tracking import open_client
+
+    client = open_client(store)
+    from mlflow.exceptions import MlflowException
+
+    table = Table(title=f"Registered models in {store}", title_justify="left")
+    for title in ("URI", "aliases", "run", "created"):
+        table.add_column(title, overflow="fold")
+    try:
+        registered = client.search_registered_models()
+    except (MlflowException, OSError) as error:
+        raise ValueError(f"cannot read the model store {store}: {str(error).splitlines()[0]}") from error
+    for model in sorted(registered, key=lambda m: m.name):
+        aliases: dict[str, list[str]] = {}
+        for alias, version in client.get_registered_model(model.name).aliases.items():
+            aliases.setdefault(str(version), []).append(f"@{alias}")
+        versions = client.search_model_versions(f"name = '{model.name}'")
+        for version in sorted(versions, key=lambda v: int(v.version)):
+            table.add_row(
+                f"models:/{model.name}/{version.version}",
+                " ".join(aliases.get(str(version.version), [])),
+                version.run_id or "",
+                _date(version.creation_timestamp),
+            )
+    return table
+
+
+def _date(milliseconds: int | None) -> str:
+    from datetime import datetime
+
+    return "" if milliseconds is None else f"{datetime.fromtimestamp(milliseconds / 1000):%Y-%m-%d %H:%M}"
