@@ -111,3 +111,15 @@ def motion(position: NDArray[Any], current: Camera, previous: Camera) -> NDArray
     visible = ((w_now > 0) & (w_before > 0))[..., None]
     with np.errstate(invalid="ignore"):
         return np.where(visible, before - now, 0.0).astype(np.float32)
+
+
+def footprint(camera: Camera, position: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the width of a pixel (H, W) at world positions (H, W, 3) on a plane that faces the camera.
+
+    It is w divided by the focal length in pixels, in scene units; negative behind the camera.
+    """
+    axis = camera.world_to_pixel[3, :3]
+    length = np.linalg.norm(axis)
+    across = camera.world_to_pixel[0, :3]
+    focal = np.linalg.norm(across - (across @ axis) / length**2 * axis) / length
+    return (project(camera, position)[1] / (focal * length)).astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data import camera as cameras
 from data.camera import Camera, DepthKind
@@ -164,7 +165,7 @@ class _Context:
         if position is None or camera is None:
             raise self._fail("depth", "position" if position is None else "the camera")
         depth = cameras.depth(camera, position, self.depth_kind)
-        depth = np.where(_no_hit(self.frame), np.float32(0), np.maximum(depth, 0))
+        depth = np.where(no_hit(self.frame), np.float32(0), np.maximum(depth, 0))
         rule = (
             "w of the projected position"
             if self.depth_kind == "z"
@@ -179,7 +180,7 @@ class _Context:
                 "motion", "position" if position is None else "the camera of this or the last frame"
             )
         motion = cameras.motion(position, camera, self.previous)
-        return np.where(_no_hit(self.frame), np.float32(0), motion), "position and both cameras"
+        return np.where(no_hit(self.frame), np.float32(0), motion), "position and both cameras"
 
     def _specular(self) -> tuple[Image, str]:
         if "diffuse" not in self.frame.buffers:
@@ -197,8 +198,8 @@ class _Context:
         return np.ones((self.frame.height, self.frame.width, 1), np.float32), "1, not accumulated"
 
 
-def _no_hit(frame: Frame) -> np.ndarray:
-    """Return (H, W, 1): position is exactly 0, and so is the normal where the frame has one."""
+def no_hit(frame: Frame) -> NDArray[np.bool_]:
+    """Return where nothing was hit (H, W, 1): position exactly 0, and so is the normal where there is one."""
     nothing = (frame.buffers["position"] == 0).all(-1, keepdims=True)
     if "normal" in frame.buffers:
         nothing &= (frame.buffers["normal"] == 0).all(-1, keepdims=True)

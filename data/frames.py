@@ -1,0 +1,126 @@
+"""Sets of frames on disk: a folder with a manifest and one EXR file per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from data.derive import derive
+from data.exr import read_frame
+from data.frame import Frame
+from data.manifest import FrameRecord, Manifest, file_sha256, load_manifest
+
+DERIVED = ("albedo", "irradiance", "color", "depth")
+"""What `FrameSet.read` adds where it is absent and can be derived."""
+
+
+class FrameSet:
+    """An ingested data set: `ROOT/manifest.json` and `ROOT/<scene>/f<NNN>.exr`.
+
+    Attributes:
+        root: The folder.
+        manifest: Its checked manifest.
+    """
+
+    def __init__(self, root: str | Path) -> None:
+        """Read the manifest.
+
+        Raises:
+            FileNotFoundError: There is no manifest; the message says what to run.
+            ValueError: It is damaged.
+        """
+        self.root = Path(root)
+        self.manifest: Manifest = load_manifest(self.root)
+
+    def scenes(self, split: str | None = None) -> list[str]:
+        """Return the names of the scenes of a split, of all scenes without one."""
+        return list(self.manifest.scenes) if split is None else list(self.manifest.splits.get(split, []))
+
+    def frames(self, scene: str) -> list[FrameRecord]:
+        """Return the records of a scene's frames in ascending order.
+
+        Raises:
+            ValueError: There is no such scene.
+        """
+        if scene not in self.manifest.scenes:
+            raise ValueError(f"{self.root} has no scene {scene!r}; scenes: {', '.join(self.manifest.scenes)}")
+        return list(self.manifest.scenes[scene].frames)
+
+    def read(
+        self, scene: str, index: int, names: Iterable[str] | None = None, *, verify: bool = True
+    ) -> Frame:
+        """Read one frame and derive what is absent.
+
+        Args:
+            scene: Name of the scene.
+            index: Number of the frame.
+            names: Buffers that must be there, derived where necessary; None: whatever of `DERIVED` can be.
+            verify: Compare size and checksum with the manifest before reading.
+
+        Raises:
+            OSError: The file is missing; the message says which command repairs the set.
+            ValueError: The file was altered, no such frame, or a named buffer cannot be derived.
+        """
+        record = next((f for f in self.frames(scene) if f.index == index), None)
+        if record is None:
+            known = [f.index for f in self.frames(scene)]
+            raise ValueError(f"{self.root}: scene {scene!r} has no frame {index}; it has {known}")
+        self._check(record, verify)
+        frame = read_frame(self.root / record.file)
+        frame = replace(frame, scene=scene, index=index, exposure=record.exposure, spp=record.spp)
+        frame.notes["sequence"] = self.manifest.scenes[scene].sequence
+        wanted = _derivable(frame) if names is None else list(names)
+        return derive(frame, wanted, depth_kind=self.manifest.depth)
+
+    def sequence(self, scene: str, names: Iterable[str] | None = None) -> Iterator[Frame]:
+        """Read the frames of a scene one after the other; `motion` is derived from the preceding camera."""
+        wanted = None if names is None else list(names)
+        previous: Frame | None = None
+        for record in self.frames(scene):
+            rest = None if wanted is None else [n for n in wanted if n != "motion"]
+            frame = self.read(scene, record.index, rest)
+            if wanted is not None and "motion" in wanted:
+                before = previous if previous is not None and previous.index == record.index - 1 else frame
+                frame = derive(frame, ["motion"], previous=before.camera)
+            previous = frame
+            yield frame
+
+    def check(self) -> list[str]:
+        """Return what does not agree with the manifest, one sentence per file; empty: all is well."""
+        problems = []
+        for scene in self.scenes():
+            for record in self.frames(scene):
+                try:
+                    self._check(record, True)
+                except (OSError, ValueError) as error:
+                    problems.append(str(error))
+        return problems
+
+    def _check(self, record: FrameRecord, verify: bool) -> None:
+        path = self.root / record.file
+        repair = f"run `trainer ingest --force … --output {self.root}` again, or restore the file"
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing, but the manifest lists it; {repair}")
+        if not verify:
+            return
+        size = path.stat().st_size
+        if size != record.bytes:
+            raise ValueError(
+                f"{path} has {size} bytes, the manifest says {record.bytes}: altered or truncated; {repair}"
+            )
+        if file_sha256(path) != record.sha256:
+            raise ValueError(f"{path} does not match the manifest's checksum: altered; {repair}")
+
+
+def _derivable(frame: Frame) -> list[str]:
+    has = frame.buffers.keys()
+    albedo = bool({"albedo", "diffuse_albedo"} & has)
+    color = {"color_a", "color_b"} <= has or "color" in has
+    found = {
+        "albedo": albedo,
+        "irradiance": color and albedo,
+        "color": color or ("irradiance" in has and albedo),
+        "depth": "position" in has and frame.camera is not None,
+    }
+    return [name for name in DERIVED if name in has or found[name]]
