@@ -45,6 +45,7 @@ def quiet_libraries() -> None:
         (r".*does not have many workers.*", UserWarning),  # the loader's own choice
         (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
         (r".*is smaller than the logging interval.*", UserWarning),
+        (r".*callbacks used to create the checkpoint need to be provided.*", UserWarning),  # test, validate
     ):
         warnings.filterwarnings("ignore", message, category)
 
@@ -114,7 +115,9 @@ class TrainingCLI(LightningCLI):
 
     def __init__(self, args: ArgsType = None) -> None:
         defaults = [str(configs.folder() / configs.DEFAULTS)]
-        kwargs: dict[str, Any] = {verb: {"default_config_files": defaults} for verb in self.subcommands()}
+        kwargs: dict[str, Any] = {
+            verb: {"default_config_files": defaults, "allow_abbrev": False} for verb in self.subcommands()
+        }
         super().__init__(
             LightningModule,
             LightningDataModule,

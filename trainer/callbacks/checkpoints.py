@@ -45,7 +45,7 @@ class _RunCheckpoint(ModelCheckpoint):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Choose the folder on the first rank; the base class tells the others."""
         if self.dirpath is None and trainer.is_global_zero and isinstance(trainer.logger, MLflowTracking):
-            self.dirpath = str(trainer.logger.folder / "checkpoints")
+            self.dirpath = str(trainer.logger.folder.resolve() / "checkpoints")
         super().setup(trainer, pl_module, stage)
 
 

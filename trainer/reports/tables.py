@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from trainer.metrics.collection import HIGHER_IS_BETTER, METRICS
 
-FORMATS = {"psnr_wskp": "{:.3f} dB", "ssim_wskp": "{:.4f}", "ssim_wskp_range1": "{:.4f}",
+FORMATS = {"psnr_wskp": "{:.2f} dB", "ssim_wskp": "{:.4f}", "ssim_wskp_range1": "{:.4f}",
            "relmse_layer": "{:.4f}", "smape_wskp": "{:.4f}"}  # fmt: skip
 
 
@@ -28,11 +29,13 @@ def scores_by_scene(logged: Mapping[str, Any], prefix: str) -> dict[str, dict[st
 def scores_table(logged: Mapping[str, Any], prefix: str) -> Table:
     """Return a table with one row per scene and method: the noisy input and the denoised frames."""
     titles = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
-    table = Table(title=titles.get(prefix, prefix), title_justify="left", header_style="bold")
-    table.add_column("scene")
-    table.add_column("image")
+    table = Table(title=titles.get(prefix, prefix), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("scene", no_wrap=True)
+    table.add_column("image", no_wrap=True)
     for name, higher in HIGHER_IS_BETTER.items():
-        table.add_column(f"{name} {'↑' if higher else '↓'}", justify="right", no_wrap=True)
+        # "ssim_wskp_range1" is the widest name; two lines keep the table within 90 columns.
+        title = name.replace("_range1", "\n_range1") if "_range1" in name else f"{name}\n"
+        table.add_column(f"{title} {'↑' if higher else '↓'}", justify="right", no_wrap=True)
     denoised = scores_by_scene(logged, prefix)
     noisy = scores_by_scene(logged, "input") if prefix == "test" else {}
     for scene, row in denoised.items():
@@ -46,6 +49,9 @@ def scores_table(logged: Mapping[str, Any], prefix: str) -> Table:
 
 def print_scores(logged: Mapping[str, Any], prefix: str) -> None:
     """Print the table of metrics per scene and averaged."""
-    Console().print(scores_table(logged, prefix))
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=100)  # a pipe has no width; narrower columns would be cut
+    console.print(scores_table(logged, prefix))
     print("Definitions: PSNR and SSIM on clamp(max(x, 0)^0.454545, 0, 1) of exposed radiance;")
     print("ssim_wskp uses data range 2 like the published tables, ssim_wskp_range1 uses 1.")

@@ -1,0 +1,99 @@
+import subprocess
+import sys
+
+import pytest
+
+from trainer import cli, configs
+from trainer.training import explain
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["trainer", *arguments])
+    code = cli.main()
+    return code, capsys.readouterr()
+
+
+def test_help_lists_every_command_and_imports_nothing_heavy():
+    script = (
+        "import sys; sys.argv = ['trainer', '--help']; from trainer.cli import main; main();"
+        "print(sorted({'torch', 'lightning', 'mlflow', 'numpy', 'OpenEXR'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert all(name in done.stdout for name in (*cli.TRAINING, *cli.COMMANDS))
+
+
+def test_every_listed_command_has_a_module_with_the_three_names():
+    import importlib
+
+    for name in cli.COMMANDS:
+        module = importlib.import_module(f"trainer.commands.{name}")
+        assert isinstance(module.HELP, str)
+        assert callable(module.add_arguments)
+        assert callable(module.run)
+
+
+def test_misspelt_command_names_the_nearest_and_exits_with_2(monkeypatch, capsys):
+    code, printed = run(monkeypatch, capsys, "prepair")
+    assert code == 2
+    assert "did you mean 'prepare'?" in printed.err
+
+
+def test_misspelt_configuration_names_the_nearest_and_exits_with_2(monkeypatch, capsys):
+    code, printed = run(monkeypatch, capsys, "fit", "--config", "wksp_bmfr.yaml")
+    assert code == 2
+    assert "did you mean wskp_bmfr.yaml?" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("option", "meant"),
+    [
+        ("--trainer.max_epoch=3", "max_epochs"),
+        ("--model.init_args.net.init_args.layer=3", "layers"),
+        ("--data.batchsize=3", "batch_size"),
+        ("--modle=3", "model"),
+    ],
+)
+def test_misspelt_option_is_an_error_that_names_the_nearest(monkeypatch, capsys, option, meant):
+    code, printed = run(monkeypatch, capsys, "fit", "--config", "wskp_bmfr.yaml", option)
+    assert code == 2
+    assert f"{meant}'?" in printed.err
+    assert "Traceback" not in printed.err
+
+
+def test_misspelt_key_in_a_file_is_an_error_that_names_the_nearest(monkeypatch, capsys, tmp_path):
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text("model:\n  init_args:\n    net:\n      init_args:\n        widht: 14\n")
+    code, printed = run(
+        monkeypatch, capsys, "fit", "--config", "wskp_bmfr.yaml", "--config", str(overlay)
+    )
+    assert code == 2
+    assert "width'?" in printed.err
+
+
+def test_bare_names_resolve_from_any_directory(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert configs.resolve("wskp_bmfr.yaml").endswith("wskp_bmfr.yaml")
+    assert configs.resolve_arguments(["--config=smoke"])[0].endswith("smoke.yaml")
+
+
+def test_a_file_of_the_users_comes_before_a_shipped_one(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wskp_bmfr.yaml").write_text("{}")
+    assert configs.resolve("wskp_bmfr.yaml") == "wskp_bmfr.yaml"
+
+
+def test_print_config_shows_defaults_file_and_overrides(monkeypatch, capsys):
+    monkeypatch.setattr(
+        sys, "argv", ["trainer", "fit", "--config", "wskp_bmfr.yaml", "--data.batch_size=3", "--print_config"]
+    )
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    text = capsys.readouterr().out
+    assert stop.value.code in (0, None)
+    for part in ("root: sample:bmfr", "batch_size: 3", "trainer.tracking.MLflowTracking", "layers: 6", "SMAPE"):
+        assert part in text, part
+
+
+def test_messages_without_a_near_name_are_left_whole():
+    assert explain("something else is wrong", {"model"}) == "something else is wrong"

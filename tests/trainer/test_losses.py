@@ -1,0 +1,34 @@
+import pytest
+import torch
+
+from trainer.losses import L1, SMAPE, RelativeL2
+
+
+def test_smape_is_the_mean_of_the_written_ratio():
+    output, target = torch.tensor([[1.0, 0.0]]), torch.tensor([[3.0, 0.5]])
+    expected = (2 / 4.01 + 0.5 / 0.51) / 2
+    assert float(SMAPE()(output, target)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_smape_gradient_flows_through_the_denominator():
+    output = torch.tensor([1.0], requires_grad=True)
+    SMAPE()(output, torch.tensor([3.0])).backward()
+    # d/do |o-t| / (o+t+e) = (-(o+t+e) - (t-o)) / (o+t+e)^2
+    assert float(output.grad) == pytest.approx((-4.01 - 2.0) / 4.01**2, rel=1e-6)
+
+
+def test_relative_l2_divides_by_target_or_by_detached_output():
+    output, target = torch.tensor([2.0], requires_grad=True), torch.tensor([1.0])
+    assert RelativeL2(epsilon=0.0)(output, target).item() == pytest.approx(1.0)
+    loss = RelativeL2(epsilon=0.0, symmetric=True)(output, target)
+    loss.backward()
+    assert loss.item() == pytest.approx(0.25)
+    assert float(output.grad) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("loss", [SMAPE(), L1(), RelativeL2(), RelativeL2(symmetric=True)])
+def test_losses_compute_in_float32_and_stay_finite_on_half_maximum(loss):
+    output = torch.full((1, 3, 4, 4), 65504.0, dtype=torch.bfloat16)
+    value = loss(output, torch.zeros(1, 3, 4, 4, dtype=torch.bfloat16))
+    assert value.dtype == torch.float32
+    assert torch.isfinite(value)

@@ -1,0 +1,48 @@
+import pytest
+
+from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint, new_folder
+
+
+def make_run(root, name, *checkpoints):
+    folder = root / "exp" / name
+    RunRecord("exp", name, "sqlite:///x", "id").save(folder)
+    (folder / "checkpoints").mkdir()
+    for checkpoint in checkpoints:
+        (folder / "checkpoints" / f"{checkpoint}.ckpt").write_bytes(b"x")
+    return folder
+
+
+def test_last_is_taken_from_the_newest_run_that_has_it(tmp_path):
+    older = make_run(tmp_path, "20260101-000000", "last", "best")
+    make_run(tmp_path, "20260102-000000", "best")
+    assert find_checkpoint("last", tmp_path, "exp") == older / "checkpoints" / "last.ckpt"
+
+
+def test_missing_checkpoint_names_the_folder_that_was_searched(tmp_path):
+    with pytest.raises(ValueError, match="no run of 'exp' below"):
+        find_checkpoint("last", tmp_path, "exp")
+    with pytest.raises(ValueError, match="no such file"):
+        find_checkpoint(str(tmp_path / "none.ckpt"), tmp_path, "exp")
+
+
+def test_run_folder_stands_for_its_last_checkpoint(tmp_path):
+    folder = make_run(tmp_path, "20260101-000000", "last")
+    path = find_checkpoint(str(folder), tmp_path, "exp")
+    assert path == folder / "checkpoints" / "last.ckpt"
+    assert folder_of_checkpoint(path) == folder.resolve()
+
+
+def test_checkpoint_outside_a_run_has_no_folder(tmp_path):
+    path = tmp_path / "moved.ckpt"
+    path.write_bytes(b"x")
+    assert folder_of_checkpoint(path) is None
+
+
+def test_runs_that_start_in_the_same_second_get_different_folders(tmp_path):
+    assert len({new_folder(tmp_path, "exp") for _ in range(3)}) == 3
+
+
+def test_damaged_record_is_named(tmp_path):
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(ValueError, match=r"run\.json is damaged"):
+        RunRecord.load(tmp_path)
