@@ -70,7 +70,7 @@ class FrameSet:
         frame = read_frame(self.root / record.file)
         frame = replace(frame, scene=scene, index=index, exposure=record.exposure, spp=record.spp)
         frame.notes["sequence"] = self.manifest.scenes[scene].sequence
-        wanted = _derivable(frame) if names is None else list(names)
+        wanted = derivable(frame) if names is None else list(names)
         return derive(frame, wanted, depth_kind=self.manifest.depth)
 
     def sequence(self, scene: str, names: Iterable[str] | None = None) -> Iterator[Frame]:
@@ -113,7 +113,8 @@ class FrameSet:
             raise ValueError(f"{path} does not match the manifest's checksum: altered; {repair}")
 
 
-def _derivable(frame: Frame) -> list[str]:
+def derivable(frame: Frame) -> list[str]:
+    """Return those of `DERIVED` that the frame has or that can be derived from what it has."""
     has = frame.buffers.keys()
     albedo = bool({"albedo", "diffuse_albedo"} & has)
     color = {"color_a", "color_b"} <= has or "color" in has

@@ -32,7 +32,7 @@ class FrameRecord:
         exposure: Factor to a displayable level.
         spp: Samples per pixel of the noisy buffers, None where unknown.
         buffers: Buffer → `half` or `float`, as stored.
-        derived: Buffer → rule, for buffers that were computed during ingestion.
+        derived: Buffer → rule, for buffers that are not in the file and are computed when it is read.
         repaired: Buffer → number of pixels that were not finite and were replaced.
     """
 

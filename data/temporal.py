@@ -30,9 +30,9 @@ BLEND = 0.2
 POSITION_LIMIT_FOOTPRINTS = 6.0
 """Automatic position limit in median pixel footprints of the first frame.
 
-At 1280x720 and 60 degrees it is 0.5 % of the median depth: 0.045 units in a sponza seen at 9 units (BMFR: 0.04),
-0.025 in a living room at 5 (BMFR: 0.03). On four sequences of 320x180 with jittered 1 spp the PSNR of the
-accumulated radiance rises up to 5 footprints and stays within 0.3 dB of its maximum from there on."""
+At 1280x720 and 60 degrees it is 0.5 % of the median depth: 0.05 units in a sponza seen at 9 units (BMFR:
+0.04), 0.03 in a living room at 5 (BMFR: 0.03). On four sequences of 320x180 with jittered 1 spp the PSNR of
+the accumulated radiance rises up to 5 footprints and stays within 0.3 dB of its maximum from there on."""
 
 NORMAL_LIMIT_SQUARED = 1.0
 """Automatic limit of the squared difference of normals: 60 degrees, BMFR's value for its classroom."""
