@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from models.ops.boxes import box_mean_padded, box_sum, exporting
+from models.ops.boxes import box_sum, box_sums_exported, exporting
 from models.ops.window import log_maps, to_band, window_sums
 
 EXPORTED_SPAN = 128.0
@@ -60,10 +60,10 @@ def reconstruct(
     """
     if not exporting():
         _check(log_importance, fusion_logits, kernel_sizes)
-    irradiance, log_importance = _wide(irradiance), _wide(log_importance)
-    fusion = torch.softmax(_wide(fusion_logits), 1)
+    irradiance, log_importance, fusion_logits = _wide(irradiance), _wide(log_importance), _wide(fusion_logits)
     if exporting():
-        return _reconstruct_exported(irradiance, log_importance, fusion, kernel_sizes)
+        return _reconstruct_exported(irradiance, log_importance, fusion_logits, kernel_sizes)
+    fusion = torch.softmax(fusion_logits, 1)
     needs_gradient = any(t.requires_grad for t in (irradiance, log_importance, fusion))
     if torch.is_grad_enabled() and needs_gradient:
         result: Tensor = _Reconstruct.apply(irradiance, log_importance, fusion, tuple(kernel_sizes))
@@ -179,18 +179,20 @@ class _Reconstruct(torch.autograd.Function):
 
 
 def _reconstruct_exported(
-    irradiance: Tensor, log_importance: Tensor, fusion: Tensor, kernel_sizes: Sequence[int]
+    irradiance: Tensor, log_importance: Tensor, fusion_logits: Tensor, kernel_sizes: Sequence[int]
 ) -> Tensor:
     """The same without branches on data and writes in place, for graphs that other runtimes execute.
 
     Without a backward pass one band of 128 fits float32: e**60 for the largest importance times radiance
-    up to 1e9 and e**-68 for the smallest times radiance down to 1e-7.
+    up to 1e9 and e**-68 for the smallest times radiance down to 1e-7. Softmax over channels is written out:
+    ONNX Runtime transposes the image for it.
     """
     depth = log_importance.amax((-2, -1), keepdim=True) - log_importance
     energy = torch.exp(60.0 - depth.clamp(max=EXPORTED_SPAN))
+    maps = [energy[:, index : index + 1] for index in range(len(kernel_sizes))]
+    sums = box_sums_exported([torch.cat([irradiance * e, e], 1) for e in maps], kernel_sizes)
+    shares = torch.exp(fusion_logits - fusion_logits.amax(1, keepdim=True))
     total = torch.zeros_like(irradiance)
-    for index, size in enumerate(kernel_sizes):
-        one = slice(index, index + 1)
-        sums = box_mean_padded(torch.cat([irradiance * energy[:, one], energy[:, one]], 1), size)
-        total = total + fusion[:, one] * (sums[:, :3] / sums[:, 3:])
-    return total
+    for index, window in enumerate(sums):
+        total = total + window[:, :3] * (shares[:, index : index + 1] / window[:, 3:])
+    return total / shares.sum(1, keepdim=True)
