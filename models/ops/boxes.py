@@ -62,7 +62,7 @@ def _sum_along(maps: Tensor, size: int, dim: int) -> Tensor:
     return total
 
 
-def box_sums_exported(stacks: Sequence[Tensor], sizes: Sequence[int]) -> list[Tensor]:
+def box_sums_exported(stacks: Sequence[Tensor], sizes: Sequence[int], channels: int) -> list[Tensor]:
     """Sum a window of its own size in every stack, in the form that runs fast in an exported graph.
 
     TorchScript runs the additions of `box_sum`. In a graph for ONNX they would be a hundred slices; there
@@ -72,22 +72,20 @@ def box_sums_exported(stacks: Sequence[Tensor], sizes: Sequence[int]) -> list[Te
     Args:
         stacks: Tensors (B, C, H, W), one for each size.
         sizes: Odd window sizes.
+        channels: C; as a number, since the tensors' shapes are symbols there.
     """
     if torch.jit.is_tracing() and not torch.onnx.is_in_onnx_export():
         return [box_sum(stack, size) for stack, size in zip(stacks, sizes, strict=True)]
-    channels, reach = stacks[0].shape[1], max(sizes) // 2
-    rows = torch.cat([_ones(stacks[0], channels, size, reach) for size in sizes])
-    joined = torch.cat(list(stacks), 1)
-    groups = channels * len(sizes)
+    reach = max(sizes) // 2
+    margins = [reach - size // 2 for size in sizes]
+    # Literal sizes, so that the kernels become constants of the graph.
+    rows = torch.cat(
+        [F.pad(torch.ones(channels, 1, 1, s), (m, m)) for s, m in zip(sizes, margins, strict=True)]
+    ).to(stacks[0])
+    joined, groups = torch.cat(list(stacks), 1), channels * len(sizes)
     wide = F.conv2d(joined, rows, padding=(0, reach), groups=groups)
-    return list(
-        F.conv2d(wide, rows.transpose(-1, -2), padding=(reach, 0), groups=groups).chunk(len(sizes), 1)
-    )
-
-
-def _ones(like: Tensor, channels: int, size: int, reach: int) -> Tensor:
-    margin = reach - size // 2
-    return F.pad(like.new_ones(channels, 1, 1, size), (margin, margin))
+    sums = F.conv2d(wide, rows.transpose(-1, -2), padding=(reach, 0), groups=groups)
+    return list(sums.split(channels, 1))
 
 
 def exporting() -> bool:

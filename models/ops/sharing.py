@@ -190,7 +190,7 @@ def _reconstruct_exported(
     depth = log_importance.amax((-2, -1), keepdim=True) - log_importance
     energy = torch.exp(60.0 - depth.clamp(max=EXPORTED_SPAN))
     maps = [energy[:, index : index + 1] for index in range(len(kernel_sizes))]
-    sums = box_sums_exported([torch.cat([irradiance * e, e], 1) for e in maps], kernel_sizes)
+    sums = box_sums_exported([torch.cat([irradiance * e, e], 1) for e in maps], kernel_sizes, 4)
     shares = torch.exp(fusion_logits - fusion_logits.amax(1, keepdim=True))
     total = torch.zeros_like(irradiance)
     for index, window in enumerate(sums):
