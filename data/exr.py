@@ -95,7 +95,8 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
 def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = None) -> dict[str, str]:
     """Write a frame as one EXR file in our naming, whole or not at all.
 
-    Half precision where the vocabulary allows it and no value exceeds 65504, float32 otherwise.
+    Half precision where the vocabulary allows it and no value exceeds 65504, and where it loses nothing;
+    float32 otherwise.
 
     Args:
         frame: What to write, with scene, index, camera, exposure and spp in header attributes.
@@ -119,7 +120,8 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
             raise ValueError(
                 f"{frame.label}: buffer {name!r} holds NaN or Inf; repair it before writing {path}"
             )
-        half = entry.half and float(np.abs(array).max(initial=0)) <= HALF_MAX
+        fits = float(np.abs(array).max(initial=0)) <= HALF_MAX
+        half = fits and (entry.half or np.array_equal(array.astype(np.float16), array))
         precision[name] = "half" if half else "float"
         for i, letter in enumerate(entry.letters):
             channels[f"{name}.{letter}"] = array[..., i].astype(np.float16 if half else np.float32)
