@@ -1,0 +1,115 @@
+"""Flips, rotations and exposure changes of training patches.
+
+Randomness has no state: what happens to a sample is a function of (seed, epoch, sample), so that it depends
+neither on the number of workers nor on where a run was interrupted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rule = Literal["wskp", "dihedral", "none"]
+Array = NDArray[np.float32]
+
+IMAGE_PLANE = frozenset({"motion", "motion_a", "motion_b"})
+"""Vectors (x to the right, y down) that turn with the image. Normals are in world space and stay."""
+
+
+class Turn(IntFlag):
+    """One of the eight symmetries of a square: transpose first, then reverse rows, then columns."""
+
+    NONE = 0
+    FLIP_X = 1
+    FLIP_Y = 2
+    TRANSPOSE = 4
+
+
+HALF_TURN = Turn.FLIP_X | Turn.FLIP_Y
+LEFT = Turn.TRANSPOSE | Turn.FLIP_Y
+"""A quarter turn counter-clockwise as seen on the screen, like numpy.rot90 of (H, W)."""
+RIGHT = Turn.TRANSPOSE | Turn.FLIP_X
+"""A quarter turn clockwise."""
+
+_MASK = (1 << 64) - 1
+
+
+def random_bits(*words: int) -> int:
+    """Return 64 well mixed bits of integers, the same on every machine (SplitMix64 over the words)."""
+    state = 0
+    for word in words:
+        state = (state + (word & _MASK) + 0x9E3779B97F4A7C15) & _MASK
+        state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+        state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & _MASK
+        state ^= state >> 31
+    return state
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What may happen to a training sample.
+
+    Attributes:
+        rule: `wskp`: with probability 0.5 exactly one of horizontal flip, vertical flip, quarter turn left,
+            quarter turn right [authors' code of Fan et al. 2021]. `dihedral`: one of the eight symmetries of
+            a square, all equally likely. `none`: nothing.
+        exposure_stops: Exposure is multiplied by 2^u, u uniform in [-stops, stops].
+        seed: Seed of the run.
+    """
+
+    rule: Rule = "wskp"
+    exposure_stops: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("wskp", "dihedral", "none"):
+            raise ValueError(f"augmentation rule {self.rule!r}; expected wskp, dihedral or none")
+        if not 0 <= self.exposure_stops <= 16:
+            raise ValueError(f"exposure_stops is {self.exposure_stops}; expected 0 to 16")
+
+    def turn(self, epoch: int, sample: int) -> Turn:
+        """Return the symmetry that is applied to a sample in an epoch."""
+        bits = random_bits(self.seed, epoch, sample, 1) >> 8
+        if self.rule == "dihedral":
+            return Turn(bits & 7)
+        if self.rule == "none" or bits & 1:
+            return Turn.NONE
+        return (Turn.FLIP_X, Turn.FLIP_Y, LEFT, RIGHT)[(bits >> 1) & 3]
+
+    def exposure_factor(self, epoch: int, sample: int) -> float:
+        """Return the factor that is applied to the sample's exposure."""
+        if self.exposure_stops == 0:
+            return 1.0
+        unit = random_bits(self.seed, epoch, sample, 2) / 2**64
+        return float(2.0 ** (self.exposure_stops * (2 * unit - 1)))
+
+
+def turned(image: Array, turn: Turn) -> Array:
+    """Return a view of an image (C, H, W) after a turn; no pixel is copied.
+
+    Raises:
+        ValueError: A quarter turn of an image that is not square, which would change its shape.
+    """
+    if turn & Turn.TRANSPOSE:
+        if image.shape[-1] != image.shape[-2]:
+            raise ValueError(f"a quarter turn needs a square patch, got {image.shape[-1]}x{image.shape[-2]}")
+        image = image.swapaxes(-1, -2)
+    if turn & Turn.FLIP_Y:
+        image = image[..., ::-1, :]
+    if turn & Turn.FLIP_X:
+        image = image[..., ::-1]
+    return image
+
+
+def turn_vectors(image: Array, turn: Turn) -> None:
+    """Turn the values of image-plane vectors (2, H, W), in place; `turned` moves their pixels."""
+    if turn & Turn.TRANSPOSE:
+        image[:] = image[::-1].copy()
+    if turn & Turn.FLIP_X:
+        np.negative(image[0], out=image[0])
+    if turn & Turn.FLIP_Y:
+        np.negative(image[1], out=image[1])

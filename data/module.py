@@ -1,0 +1,242 @@
+"""The data module: shards of frames as batches for training, validation and test."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from lightning.pytorch import LightningDataModule
+
+from data.augment import Augmentation, Rule
+from data.buffers import buffer
+from data.manifest import load_manifest
+from data.root import resolve_root
+from data.shards.batch import Batches, available
+from data.shards.cut import PrepareOptions
+from data.shards.index import Index
+from data.shards.loader import EvaluationLoader, TrainingLoader
+from data.shards.prepare import cached_path, prepare_cached
+from data.shards.progress import LineProgress
+from data.shards.read import CorruptSampleError, Sample, ShardReader
+
+Loader = TrainingLoader | EvaluationLoader
+
+
+class Shards(LightningDataModule):
+    """Patches for training and validation, whole frames for test, from shards.
+
+    A batch is a dictionary: each buffer as float32 (B, C, H, W), raw linear values; `exposure` (B,) and
+    `depth_range` (B, 2) of the whole frame; `scene` and `key`, lists of str; `frame` (B,) int64.
+
+    Every rank sees the same number of training batches, and different samples; the order follows from seed
+    and epoch, not from the number of workers, and a run continues with the next batch in the middle of an
+    epoch. Validation and test read every sample once over all ranks.
+
+    Args:
+        root: `sample:NAME`, a folder of shards, or an ingested folder, which is prepared into
+            `$PENUMBRA_CACHE` (default ~/.cache/penumbra) before the first use.
+        batch_size: Samples per batch and rank; test has batches of one frame.
+        workers: Processes that read, per rank; 0 reads in the training process.
+        seed: Seed of order and augmentation, and of patch positions where the root is prepared here.
+        augment: Flip and rotate training patches.
+        augment_rule: `wskp`: with probability 0.5 one of two flips and two quarter turns; `dihedral`: one of
+            the eight symmetries of a square.
+        exposure_stops: Vary the exposure of training patches by up to so many stops up and down.
+        train_patches: Training patches per 1280x720 frame, where the root is prepared here.
+        validation_patches: Validation patches per 1280x720 frame, where the root is prepared here.
+        patch_size: Width and height of patches, where the root is prepared here.
+        on_corrupt: What to do about a damaged sample: `raise` an error, or `skip` it, with a warning for
+            each.
+        verify: Compare each sample with its checksum when a process reads it for the first time.
+        buffers: Buffers that the network reads; these and `reference` are delivered, in evaluation also
+            `color` and `history`. None: all that the shards hold. The command line fills it in from the
+            network.
+        temporal: Deliver `irradiance` accumulated over preceding frames as stored, otherwise color / albedo
+            of the frame alone. The command line fills it in from the network.
+    """
+
+    def __init__(
+        self,
+        root: str = "sample:bmfr",
+        batch_size: int = 8,
+        workers: int = 1,
+        seed: int = 1,
+        augment: bool = True,
+        augment_rule: Rule = "wskp",
+        exposure_stops: float = 0.0,
+        train_patches: int = 80,
+        validation_patches: int = 20,
+        patch_size: int = 128,
+        on_corrupt: Literal["raise", "skip"] = "raise",
+        verify: bool = True,
+        buffers: Sequence[str] | None = None,
+        temporal: bool = True,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1 or workers < 0:
+            raise ValueError(f"batch_size {batch_size} and workers {workers}: expected at least 1 and 0")
+        if on_corrupt not in ("raise", "skip"):
+            raise ValueError(f"on_corrupt is {on_corrupt!r}; expected 'raise' or 'skip'")
+        self.root = root
+        self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        self.augmentation = Augmentation(augment_rule if augment else "none", exposure_stops, seed)
+        self.options = PrepareOptions(
+            patch_size=patch_size,
+            train_patches=train_patches,
+            validation_patches=validation_patches,
+            seed=seed,
+        )
+        self.on_corrupt, self.verify = on_corrupt, verify
+        self.buffers = None if buffers is None else tuple(buffer(name).name for name in buffers)
+        self.temporal = temporal
+        # Ranks with an odd sample less have an evaluation batch less, and with few frames none.
+        self.allow_zero_length_dataloader_with_multiple_devices = True
+        self._index: Index | None = None
+        self._loaders: dict[str, Loader] = {}
+
+    @property
+    def index(self) -> Index:
+        """Index of the shards, once they are prepared.
+
+        Raises:
+            ValueError: The root is no data set; the message says which command to run.
+            OSError: The root does not exist.
+        """
+        if self._index is None:
+            found = resolve_root(self.root)
+            path = found.path if found.kind == "shards" else cached_path(found.path, self.options)
+            self._index = Index.read(path, check_sizes=self.on_corrupt == "raise")
+        return self._index
+
+    @property
+    def manifest_hash(self) -> str:
+        """Hash of the manifest of the frames, the same whether they are prepared yet or not."""
+        found = resolve_root(self.root)
+        return load_manifest(found.path).hash if found.kind == "frames" else self.index.manifest_hash
+
+    def scenes(self, split: str) -> tuple[str, ...]:
+        """Return the scenes of a split, in order."""
+        return tuple(self.index.scenes(split))
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of samples of each split."""
+        return {split: self.index.count(split) for split in ("train", "validation", "test")}
+
+    @property
+    def corrupt(self) -> dict[str, str]:
+        """Damaged samples that were left out so far, with the reason."""
+        return {name: why for loader in self._loaders.values() for name, why in loader.corrupt.items()}
+
+    def prepare_data(self) -> None:
+        """Prepare an ingested root into the cache, in one process per node."""
+        found = resolve_root(self.root)
+        if found.kind == "frames":
+            prepare_cached(found.path, self.options, LineProgress(f"preparing {found.path.name}"))
+
+    def setup(self, stage: str) -> None:
+        """Open the index and check that it can serve what is asked.
+
+        Raises:
+            ValueError: A split that is needed is empty, or a buffer is missing.
+        """
+        needed = {"fit": ("train",), "validate": ("validation",), "test": ("test",)}.get(stage, ())
+        for split in needed:
+            if self.index.count(split) == 0:
+                raise ValueError(
+                    f"{self.index.root} has no samples in split {split!r}; prepare it from frames whose "
+                    "manifest has a scene for it"
+                )
+
+    def train_dataloader(self) -> TrainingLoader:
+        """Return the loader of training patches of this rank."""
+        batches = self._batches("train", self.augmentation)
+        rank, world = self._place()
+        loader = TrainingLoader(
+            batches,
+            self.batch_size,
+            self.seed,
+            rank=rank,
+            world=world,
+            workers=self.workers,
+            pin_memory=self._on_gpu(),
+            done=self._done if self.trainer is not None else None,
+            fixed_order=self._overfits(),
+        )
+        return self._keep("train", loader)
+
+    def val_dataloader(self) -> EvaluationLoader | list[Any]:
+        """Return the loader of this rank's validation patches; nothing where there are none."""
+        return self._evaluation("validation", self.batch_size)
+
+    def test_dataloader(self) -> EvaluationLoader | list[Any]:
+        """Return the loader of this rank's whole test frames, one at a time in the order of scene and
+        frame."""
+        return self._evaluation("test", 1)
+
+    def teardown(self, stage: str) -> None:
+        """End the worker processes."""
+        for loader in self._loaders.values():
+            loader.close()
+
+    def _evaluation(self, split: str, batch_size: int) -> EvaluationLoader | list[Any]:
+        if self.index.count(split) == 0:
+            return []
+        rank, world = self._place()
+        loader = EvaluationLoader(
+            self._batches(split, None),
+            batch_size,
+            rank=rank,
+            world=world,
+            workers=self.workers,
+            pin_memory=self._on_gpu(),
+        )
+        return self._keep(split, loader)
+
+    def _batches(self, split: str, augmentation: Augmentation | None) -> Batches:
+        reader = ShardReader(self.index, split, self.verify)
+        names = self._names(reader, evaluation=augmentation is None)
+        return Batches(reader, names, self.temporal, self.buffers or (), augmentation, self.on_corrupt)
+
+    def _names(self, reader: ShardReader, evaluation: bool) -> tuple[str, ...]:
+        sample = self._first_readable(reader)
+        held = available(sample)
+        wanted = held if self.buffers is None else (*self.buffers, "reference")
+        missing = [name for name in wanted if name not in held]
+        if missing:
+            raise ValueError(
+                f"{self.index.root} has no buffer {', '.join(missing)}; its {reader.split} samples hold "
+                f"{', '.join(sample.buffers)}. Prepare again: trainer prepare FRAMES --output SHARDS "
+                f"--buffers {','.join(missing)}"
+            )
+        pictures = [name for name in ("color", "history") if evaluation and name in held]
+        return tuple(dict.fromkeys([*wanted, *pictures]))
+
+    def _first_readable(self, reader: ShardReader) -> Sample:
+        for number in range(len(reader)):
+            try:
+                return reader.sample(number)
+            except CorruptSampleError:
+                if self.on_corrupt == "raise":
+                    raise
+        raise ValueError(f"{self.index.root} has no {reader.split} sample that can be read")
+
+    def _keep(self, split: str, loader: Any) -> Any:
+        if split in self._loaders:
+            self._loaders[split].close()
+        self._loaders[split] = loader
+        return loader
+
+    def _place(self) -> tuple[int, int]:
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+    def _on_gpu(self) -> bool:
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
+
+    def _overfits(self) -> bool:
+        return bool(getattr(self.trainer, "overfit_batches", 0))
+
+    def _done(self) -> int:
+        """Return how many batches of this epoch are finished; Lightning restores the number when it
+        resumes."""
+        assert self.trainer is not None
+        return int(self.trainer.fit_loop.epoch_loop.batch_progress.current.ready)

@@ -1,0 +1,118 @@
+"""What `--data.root` may name: the sample that ships, ingested frames, prepared shards."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from data.manifest import MANIFEST
+from data.shards.index import INDEX
+
+SAMPLE = "sample:"
+
+
+@dataclass(frozen=True)
+class Root:
+    """A data root that can be used.
+
+    Attributes:
+        kind: `frames`: ingested, a manifest and EXR files; `shards`: prepared.
+        path: The folder.
+    """
+
+    kind: Literal["frames", "shards"]
+    path: Path
+
+
+def sample_folder() -> Path:
+    """Return the folder of the data sets that ship with the package."""
+    return Path(__file__).resolve().parent / "sample"
+
+
+def samples() -> list[str]:
+    """Return the names of the data sets that ship."""
+    return sorted(path.parent.name for path in sample_folder().glob(f"*/{MANIFEST}"))
+
+
+def resolve_root(root: str | Path) -> Root:
+    """Return what a data root is.
+
+    Args:
+        root: `sample:NAME`, an ingested folder or a prepared folder; `~` is the home folder.
+
+    Raises:
+        ValueError: It is none of these; the message says which command makes it one.
+        FileNotFoundError: There is no such folder or sample.
+    """
+    if str(root).startswith(SAMPLE):
+        return _sample(str(root).removeprefix(SAMPLE))
+    path = Path(root).expanduser()
+    if (path / INDEX).is_file():
+        return Root("shards", path)
+    if (path / MANIFEST).is_file():
+        return Root("frames", path)
+    unfinished = path.with_name(path.name + ".partial")
+    if (unfinished / "plan.json").is_file():
+        raise ValueError(
+            f"{path} is not finished, its preparation was interrupted; continue it with: "
+            f"trainer prepare FRAMES --output {path}"
+        )
+    if not path.is_dir():
+        what = "is a file" if path.exists() else "does not exist"
+        raise FileNotFoundError(
+            f"data root {path} {what}; name a folder made by `trainer ingest` or `trainer prepare`, or "
+            f"{' or '.join(SAMPLE + name for name in samples()) or 'a sample'}"
+        )
+    raise ValueError(_advice(path))
+
+
+def _sample(name: str) -> Root:
+    known = samples()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {SAMPLE}{near[0]}? " if near else ""
+        listed = ", ".join(SAMPLE + other for other in known) or "none is installed"
+        raise FileNotFoundError(f"there is no data set {SAMPLE}{name}; {hint}known: {listed}")
+    return Root("frames", sample_folder() / name)
+
+
+def _advice(path: Path) -> str:
+    """Return what a folder without manifest and index seems to be, and the command for it."""
+    if next(path.glob("*.tar"), None) is not None:
+        return (
+            f"{path} holds shards but no {INDEX}, so they are not complete; prepare them anew: "
+            f"trainer prepare FRAMES --output {path.with_name(path.name + '-shards')}"
+        )
+    layout = _layout(path)
+    if layout is not None:
+        source, name = layout
+        return (
+            f"{path} is a data set in the layout {name!r} that has to be ingested first: "
+            f"trainer ingest --layout {name} {source} --output {path.with_name(path.name + '-frames')}"
+        )
+    inner = next((p.parent for name in (MANIFEST, INDEX) for p in sorted(path.glob(f"*/{name}"))), None)
+    if inner is not None:
+        return f"{path} is no data set, but {inner} is; use --data.root {inner}"
+    if next(path.glob("*/f[0-9]*.exr"), None) is not None:
+        return (
+            f"{path} holds frames but no {MANIFEST}, so their ingestion did not finish; run it again: "
+            f"trainer ingest --layout LAYOUT SOURCE --output {path}"
+        )
+    return (
+        f"{path} is no data set: it has neither {MANIFEST} (made by `trainer ingest --layout LAYOUT SOURCE "
+        f"--output DIR`) nor {INDEX} (made by `trainer prepare DIR --output SHARDS`)"
+    )
+
+
+def _layout(path: Path) -> tuple[Path, str] | None:
+    """Return the root and name of the published layout that a folder looks like."""
+    if any(path.glob("*/inputs/color*.exr")):
+        return path, "bmfr"
+    if any(path.glob("inputs/color*.exr")):
+        return path.resolve().parent, "bmfr"
+    for pattern in ("*/sequence.json", "*/*/sequence.json", "sequence.json"):
+        if any(path.glob(pattern)):
+            return path if pattern != "sequence.json" else path.resolve().parent, "penumbra"
+    return None

@@ -1,0 +1,195 @@
+"""Makes batches of samples: raw bytes of the mapped shards to float32 (B, C, H, W), turned on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, get_worker_info
+
+from data.augment import IMAGE_PLANE, Augmentation, Turn, turn_vectors, turned
+from data.buffers import buffer
+from data.shards.read import CorruptSampleError, Sample, ShardReader
+
+Batch = dict[str, Any]
+
+
+class Order(NamedTuple):
+    """What a worker is told to read: samples of one batch, and the epoch for augmentation."""
+
+    epoch: int
+    samples: tuple[int, ...]
+
+
+class Packed(NamedTuple):
+    """A batch as it travels from a worker: all images in one piece of shared memory.
+
+    Attributes:
+        pixels: float32, one after another each buffer's (B, C, H, W).
+        shapes: Name and shape of each.
+        numbers: (B, 3) float64: exposure and depth range.
+        samples: Scene, frame and key of each.
+        corrupt: Samples that were left out, with the reason.
+    """
+
+    pixels: Tensor
+    shapes: tuple[tuple[str, tuple[int, int, int, int]], ...]
+    numbers: Tensor
+    samples: tuple[tuple[str, int, str], ...]
+    corrupt: tuple[tuple[str, str], ...]
+
+    def unpack(self) -> Batch:
+        """Return the batch: views of `pixels`, frame numbers, scenes, frames, keys."""
+        batch: Batch = {}
+        start = 0
+        for name, shape in self.shapes:
+            size = int(np.prod(shape))
+            batch[name] = self.pixels[start : start + size].view(shape)
+            start += size
+        numbers = self.numbers.to(torch.float32)
+        batch["exposure"] = numbers[:, 0].contiguous()
+        batch["depth_range"] = numbers[:, 1:].contiguous()
+        batch["scene"] = [scene for scene, _, _ in self.samples]
+        batch["frame"] = torch.tensor([frame for _, frame, _ in self.samples], dtype=torch.int64)
+        batch["key"] = [key for _, _, key in self.samples]
+        return batch
+
+
+class Batches(Dataset[Packed]):
+    """Maps an `Order` to a batch.
+
+    Args:
+        reader: The split.
+        names: Buffers to deliver.
+        temporal: `irradiance` as it is stored, accumulated over preceding frames; and `color`, where it is
+            one of the network's `inputs`, made of it. Otherwise that of the frame alone, color / albedo.
+        inputs: What the network reads, of `names`.
+        augmentation: What happens to training samples; None for evaluation.
+        on_corrupt: `raise`, or `skip`: in training the next sample takes the place of a damaged one, in
+            evaluation it is left out.
+    """
+
+    def __init__(
+        self,
+        reader: ShardReader,
+        names: Iterable[str],
+        temporal: bool,
+        inputs: Iterable[str] = (),
+        augmentation: Augmentation | None = None,
+        on_corrupt: str = "raise",
+    ) -> None:
+        self.reader, self.temporal = reader, temporal
+        self.names = tuple(dict.fromkeys(names))
+        self.inputs = frozenset(inputs)
+        self.augmentation, self.on_corrupt = augmentation, on_corrupt
+
+    def __len__(self) -> int:
+        return len(self.reader)
+
+    def __getitem__(self, order: Order) -> Packed:
+        numbers, corrupt = self._readable(order.samples)
+        samples = [self.reader.sample(number) for number in numbers]
+        if not samples:
+            return Packed(torch.empty(0), (), torch.empty(0, 3), (), corrupt)
+        shapes = tuple((name, (len(samples), buffer(name).channels, *_size(samples))) for name in self.names)
+        pixels = _allocate(sum(int(np.prod(shape)) for _, shape in shapes))
+        turns = [self._turn(order.epoch, number) for number in numbers]
+        start = 0
+        for name, shape in shapes:
+            size = int(np.prod(shape))
+            target = pixels[start : start + size].view(shape)
+            for row, number in enumerate(numbers):
+                self._fill(target[row], number, name, turns[row])
+            start += size
+        return Packed(
+            pixels,
+            shapes,
+            torch.tensor([self._numbers(order.epoch, n, s) for n, s in zip(numbers, samples, strict=True)]),
+            tuple((sample.scene, sample.frame, sample.key) for sample in samples),
+            corrupt,
+        )
+
+    def _readable(self, numbers: Iterable[int]) -> tuple[list[int], tuple[tuple[str, str], ...]]:
+        found, corrupt = [], {}
+        for number in numbers:
+            for candidate in self._candidates(number):
+                try:
+                    self.reader.sample(candidate)
+                except CorruptSampleError as error:
+                    if self.on_corrupt != "skip":
+                        raise
+                    corrupt[error.sample] = str(error)
+                else:
+                    found.append(candidate)
+                    break
+        if not found and self.augmentation is not None:
+            raise ValueError(f"no training sample can be read: {next(iter(corrupt.values()))}")
+        return found, tuple(corrupt.items())
+
+    def _candidates(self, number: int) -> Iterable[int]:
+        if self.augmentation is None:
+            return (number,)
+        total = len(self.reader)
+        return ((number + step) % total for step in range(total))
+
+    def _turn(self, epoch: int, number: int) -> Turn:
+        return Turn.NONE if self.augmentation is None else self.augmentation.turn(epoch, number)
+
+    def _numbers(self, epoch: int, number: int, sample: Sample) -> tuple[float, float, float]:
+        factor = 1.0 if self.augmentation is None else self.augmentation.exposure_factor(epoch, number)
+        return (sample.exposure * factor, *sample.depth_range)
+
+    def _fill(self, target: Tensor, number: int, name: str, turn: Turn) -> None:
+        source = self._source(number, name)
+        if turn == Turn.NONE:
+            target.copy_(source)
+            return
+        # Converting first and turning then is several times faster than both in one strided pass.
+        plain = source.to(torch.float32).numpy()
+        np.copyto(target.numpy(), turned(plain, turn))
+        if name in IMAGE_PLANE:
+            turn_vectors(target.numpy(), turn)
+
+    def _source(self, number: int, name: str) -> Tensor:
+        """Return a buffer (C, H, W) of a sample, stored or computed."""
+        sample, reader = self.reader.sample(number), self.reader
+        stored = sample.buffers
+        accumulated_color = self.temporal and sample.accumulated and "color" in self.inputs
+        if name == "color" and (name not in stored or accumulated_color):
+            return reader.array(number, "irradiance").float() * reader.array(number, "albedo").float()
+        if name == "irradiance" and (name not in stored or (sample.accumulated and not self.temporal)):
+            return reader.array(number, "color").float() / reader.array(number, "albedo").float()
+        return reader.array(number, name)
+
+
+def available(sample: Sample) -> tuple[str, ...]:
+    """Return the buffers that a sample holds or that follow from them."""
+    names = dict.fromkeys(sample.buffers)
+    if "irradiance" in names and "albedo" in names:
+        names["color"] = None
+    if "color" in names and "albedo" in names:
+        names["irradiance"] = None
+    return tuple(names)
+
+
+def _size(samples: list[Sample]) -> tuple[int, int]:
+    sizes = {(sample.height, sample.width) for sample in samples}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
+        raise ValueError(f"samples of different size in one batch: {listed}; whole frames need a batch of 1")
+    return sizes.pop()
+
+
+def _allocate(count: int) -> Tensor:
+    """Return uninitialised float32 memory, shared between processes when called in a worker.
+
+    A worker that fills ordinary memory makes the queue copy the batch into shared memory; torch's own
+    collation avoids that in the same way.
+    """
+    if get_worker_info() is None:
+        return torch.empty(count)
+    storage = torch.UntypedStorage._new_shared(4 * count)
+    return torch.empty(0).set_(storage, 0, (count,), (1,))

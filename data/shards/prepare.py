@@ -1,0 +1,258 @@
+"""Cuts the frames of a data set into shards: planned beforehand, so that it can stop and go on anywhere.
+
+Which patch goes into which shard follows from the manifest and the options alone. Scenes are independent and
+may be done by several processes; the result does not depend on their number. While it is being made a result
+lies in `OUTPUT.partial`: finished shards below `shards/`, a record of each below `records/`. When all are
+there, the index is written and the folder gets its name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from multiprocessing.connection import wait as wait_for
+from pathlib import Path
+from typing import Any
+
+from data.frames import FrameSet
+from data.shards.cut import PrepareOptions, ShardPlan, make_scene, plan_shards
+from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
+
+Progress = Callable[[int, int], None]
+"""Called with the number of samples that are done and their total."""
+
+
+def prepare(
+    root: Path,
+    output: Path,
+    options: PrepareOptions,
+    *,
+    processes: int = 1,
+    force: bool = False,
+    wait_for_others: bool = False,
+    progress: Progress | None = None,
+) -> Index:
+    """Cut an ingested data set into shards; continues where an earlier call was interrupted.
+
+    Args:
+        root: The ingested data set.
+        output: The folder of shards to make.
+        options: How.
+        processes: Number of processes; each takes whole scenes.
+        force: Replace shards that are there already.
+        wait_for_others: Where another process makes the same output, wait and take its result instead of
+            failing.
+        progress: Called now and then.
+
+    Returns:
+        The index of the finished folder.
+
+    Raises:
+        ValueError: `output` exists, belongs to something else, or is being made with other options; or the
+            frames cannot be cut.
+        OSError: A file cannot be read or written.
+    """
+    frames = FrameSet(root)
+    output = Path(os.path.abspath(output))
+    with _locked(output, wait_for_others):
+        if wait_for_others and (output / INDEX).is_file():
+            return Index.read(output)
+        _check_output(output, force)
+        work = output.with_name(output.name + ".partial")
+        identity = {"version": VERSION, "manifest_hash": frames.manifest.hash, "options": options.to_dict()}
+        _open_work(work, identity, force)
+        plans = plan_shards(frames, options)
+        records = _make_all(frames, work, plans, options, processes, progress or (lambda done, total: None))
+        shards = tuple(record for record in records if record.samples)
+        manifest = frames.manifest
+        skipped = sum(record.skipped for record in records)
+        Index(work / "shards", manifest.hash, manifest.to_json(), options.to_dict(), shards, skipped).write()
+        _publish(work, output)
+        return Index.read(output)
+
+
+def cache_folder() -> Path:
+    """Return where automatically prepared shards are kept: `$PENUMBRA_CACHE`, or ~/.cache/penumbra."""
+    return Path(os.environ.get("PENUMBRA_CACHE") or Path.home() / ".cache" / "penumbra").absolute()
+
+
+def prepare_cached(root: Path, options: PrepareOptions, progress: Progress | None = None) -> Index:
+    """Return shards of an ingested data set from the cache, made now if they are not there.
+
+    They are keyed by manifest and options. Several processes may call this at the same time.
+    """
+    output = cached_path(root, options)
+    if (output / INDEX).is_file():
+        return Index.read(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    return prepare(root, output, options, wait_for_others=True, progress=progress)
+
+
+def cached_path(root: Path, options: PrepareOptions) -> Path:
+    """Return the cache folder of a data set with these options."""
+    manifest = FrameSet(root).manifest
+    text = json.dumps([VERSION, manifest.hash, options.to_dict()], sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return cache_folder() / "shards" / f"{root.absolute().name}-{key}"
+
+
+def _make_all(
+    frames: FrameSet,
+    work: Path,
+    plans: list[ShardPlan],
+    options: PrepareOptions,
+    processes: int,
+    progress: Progress,
+) -> list[ShardRecord]:
+    sizes = {plan.file: len(plan.samples) for plan in plans}
+    total = sum(sizes.values())
+    done = _finished(work, plans)
+    missing: dict[str, list[ShardPlan]] = {}
+    for plan in plans:
+        if plan.file not in done:
+            missing.setdefault(plan.scene, []).append(plan)
+
+    def report() -> None:
+        names = {path.name.removesuffix(".json") for path in (work / "records").glob("*.tar.json")}
+        progress(sum(size for file, size in sizes.items() if file in names), total)
+
+    report()
+    jobs = [(str(frames.root), scene, group, options, str(work)) for scene, group in missing.items()]
+    if processes > 1 and len(jobs) > 1:
+        _in_processes(jobs, min(processes, len(jobs)), report)
+    else:
+        for job in jobs:
+            make_scene(*job, report=report)
+    return [_record(work, plan.file) for plan in plans]
+
+
+def _in_processes(jobs: list[tuple[Any, ...]], processes: int, report: Callable[[], None]) -> None:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=_end_with_parent) as pool:
+        futures = [pool.submit(make_scene, *job) for job in jobs]
+        try:
+            pending = set(futures)
+            while pending:
+                finished, pending = wait(pending, timeout=0.5, return_when=FIRST_EXCEPTION)
+                for future in finished:
+                    future.result()
+                report()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _end_with_parent() -> None:
+    """End this worker when the process that started it is gone, however that happened."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        wait_for([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
+
+
+def _record(work: Path, file: str) -> ShardRecord:
+    return ShardRecord.from_dict(json.loads((work / "records" / f"{file}.json").read_text(encoding="utf-8")))
+
+
+def _finished(work: Path, plans: list[ShardPlan]) -> set[str]:
+    """Return the shards that are complete by their record's checksum; other records are removed."""
+    done = set()
+    for plan in plans:
+        path = work / "records" / f"{plan.file}.json"
+        if not path.is_file():
+            continue
+        record, shard = _record(work, plan.file), work / "shards" / plan.file
+        if not record.samples or (shard.is_file() and _sha256(shard) == record.sha256):
+            done.add(plan.file)
+        else:
+            path.unlink()
+    return done
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_output(output: Path, force: bool) -> None:
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise ValueError(f"{output} is a file; name a folder for the shards")
+    ours = (output / INDEX).is_file()
+    if any(output.iterdir()) and not ours:
+        raise ValueError(f"{output} holds other files; name a new folder for the shards")
+    if ours and not force:
+        raise ValueError(f"{output} holds shards already; --force replaces them")
+
+
+def _open_work(work: Path, identity: dict[str, Any], force: bool) -> None:
+    path = work / "plan.json"
+    if path.is_file():
+        if json.loads(path.read_text(encoding="utf-8")) == identity:
+            for left in (work / "shards").glob(".*.partial"):
+                left.unlink(missing_ok=True)
+            return
+        if not force:
+            raise ValueError(
+                f"{work} holds the beginning of shards from other frames or options; repeat the command that "
+                "began them, remove the folder, or start over with --force"
+            )
+    if work.is_dir():
+        shutil.rmtree(work)
+    (work / "shards").mkdir(parents=True)
+    (work / "records").mkdir()
+    write_json(path, identity)
+
+
+def _publish(work: Path, output: Path) -> None:
+    old = output.with_name(f".{output.name}.old")
+    if output.is_dir():
+        if any(output.iterdir()):
+            os.replace(output, old)
+        else:
+            output.rmdir()
+    os.replace(work / "shards", output)
+    shutil.rmtree(work)
+    if old.is_dir():
+        shutil.rmtree(old)
+
+
+@contextlib.contextmanager
+def _locked(output: Path, wait_for_others: bool) -> Iterator[None]:
+    """Hold `.NAME.lock` beside the output; the system releases it when the process ends in whatever way."""
+    path = output.with_name(f".{output.name}.lock")
+    while True:
+        try:
+            file = path.open("w")
+        except OSError as error:
+            raise OSError(
+                error.errno, f"cannot write shards into {output.parent}: {error.strerror}", str(path)
+            ) from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait_for_others else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            file.close()
+            raise ValueError(f"another process is preparing {output}; wait until it is done") from error
+        # The holder before us may have removed the name, and a third process made a new file of that name.
+        if path.exists() and path.stat().st_ino == os.fstat(file.fileno()).st_ino:
+            break
+        file.close()
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()

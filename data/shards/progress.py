@@ -1,0 +1,55 @@
+"""Progress of a preparation: rate and remaining time, as plain lines."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+
+def duration(seconds: float) -> str:
+    """Return a time span such as `1:02:03` or `4:05`."""
+    whole = round(seconds)
+    hours, rest = divmod(whole, 3600)
+    text = f"{rest // 60}:{rest % 60:02d}" if hours == 0 else f"{hours}:{rest // 60:02d}:{rest % 60:02d}"
+    return text
+
+
+class Rate:
+    """Samples per second and time left since the first call; samples of an earlier run do not count."""
+
+    def __init__(self) -> None:
+        self._start: tuple[float, int] | None = None
+
+    def text(self, done: int, total: int) -> str:
+        """Return `12/80 patches, 34.5/s, 0:02 left`."""
+        now = time.monotonic()
+        if self._start is None:
+            self._start = (now, done)
+        begun, before = self._start
+        rate = (done - before) / (now - begun) if now > begun else 0.0
+        text = f"{done}/{total} samples"
+        if rate > 0 and done < total:
+            text += f", {rate:.1f}/s, {duration((total - done) / rate)} left"
+        return text
+
+
+class LineProgress:
+    """Prints a line to standard error at the start, then at most every ten seconds, and at the end.
+
+    Args:
+        title: Beginning of each line.
+        interval: Seconds between lines.
+    """
+
+    def __init__(self, title: str, interval: float = 10.0) -> None:
+        self.title, self.interval = title, interval
+        self._rate = Rate()
+        self._last: float | None = None
+
+    def __call__(self, done: int, total: int) -> None:
+        """Report that `done` of `total` samples are finished."""
+        text = self._rate.text(done, total)
+        now = time.monotonic()
+        if self._last is None or now - self._last >= self.interval or done == total:
+            self._last = now
+            print(f"{self.title}: {text}", file=sys.stderr, flush=True)
