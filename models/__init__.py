@@ -4,8 +4,9 @@
 `models.denoiser.Denoiser`. The contract itself can be imported from here too.
 """
 
+from models.classical.joint_bilateral import JointBilateral
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.wskp import WSKP
 
-__all__ = ["WSKP"]
+__all__ = ["WSKP", "JointBilateral"]
