@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from data.buffers import BUFFERS, buffer
 from data.camera import Camera
+from data.exr_image import HALF_FLOOR as HALF_FLOOR
 from data.exr_image import HALF_MAX as HALF_MAX
 from data.exr_image import ExrImage as ExrImage
 from data.exr_image import read_exr as read_exr
@@ -95,8 +96,8 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
 def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = None) -> dict[str, str]:
     """Write a frame as one EXR file in our naming, whole or not at all.
 
-    Half precision where the vocabulary allows it and no value exceeds 65504, and where it loses nothing;
-    float32 otherwise.
+    Half precision where the vocabulary allows it and the range fits (no value above 65504, and not all so
+    small that they would lie among the subnormal numbers), and where it loses nothing; float32 otherwise.
 
     Args:
         frame: What to write, with scene, index, camera, exposure and spp in header attributes.
@@ -120,13 +121,22 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
             raise ValueError(
                 f"{frame.label}: buffer {name!r} holds NaN or Inf; repair it before writing {path}"
             )
-        fits = float(np.abs(array).max(initial=0)) <= HALF_MAX
-        half = fits and (entry.half or np.array_equal(array.astype(np.float16), array))
+        half = _half_holds(array) if entry.half else _half_is_exact(array)
         precision[name] = "half" if half else "float"
         for i, letter in enumerate(entry.letters):
             channels[f"{name}.{letter}"] = array[..., i].astype(np.float16 if half else np.float32)
     write_exr(path, channels, _attributes(frame))
     return precision
+
+
+def _half_holds(array: Image) -> bool:
+    largest = float(np.abs(array).max(initial=0))
+    return largest == 0 or HALF_FLOOR <= largest <= HALF_MAX
+
+
+def _half_is_exact(array: Image) -> bool:
+    small = float(np.abs(array).max(initial=0)) <= HALF_MAX
+    return small and np.array_equal(array.astype(np.float16), array)
 
 
 def _attributes(frame: Frame) -> dict[str, Any]:
@@ -182,10 +192,8 @@ def _groups(image: ExrImage, only: str | None) -> tuple[dict[str, list[str]], li
             groups[name] = channels
             ignored += [c for c in letters.values() if c not in channels]
     if not groups:
-        raise ValueError(
-            f"{image.path}: unknown channel naming: {', '.join(sorted(image.channels))}. "
-            f"Known: {KNOWN_NAMINGS}"
-        )
+        found = ", ".join(ignored[:12]) + (f" and {len(ignored) - 12} more" if len(ignored) > 12 else "")
+        raise ValueError(f"{image.path}: unknown channel naming: {found}. Known: {KNOWN_NAMINGS}")
     return groups, sorted(ignored)
 
 

@@ -22,6 +22,10 @@ from numpy.typing import NDArray
 HALF_MAX = 65504.0
 """Largest finite half precision number; larger values are stored in float32."""
 
+HALF_FLOOR = 2.0**-8
+"""Images that nowhere exceed this, but are not zero, are stored in float32: below it half precision has fewer
+than eleven bits for much of a picture's range."""
+
 _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP = 0x800
 _EIGHT_BIT = {

@@ -91,7 +91,8 @@ def _scene(folder: Path) -> Scene:
     if unlisted:
         raise ValueError(f"{folder / _SIDECAR}: frame {unlisted[0]} is not described, but its file exists")
     name = str(sidecar.get("scene") or folder.name)
-    reference = sidecar["frames"][0].get("reference") or {}
+    counts = sorted({s for f in sidecar["frames"] if (s := (f.get("reference") or {}).get("spp"))})
+    spp = " to ".join(str(s) for s in dict.fromkeys((counts[0], counts[-1]))) if counts else "unknown"
     renderer = f"{sidecar.get('renderer', 'unknown renderer')} {sidecar.get('renderer_version', '')}".strip()
     return Scene(
         name,
@@ -99,7 +100,7 @@ def _scene(folder: Path) -> Scene:
         partial(read, folder),
         depth="euclidean",
         sequence=sidecar.get("set") == "video",
-        provenance=f"{renderer}, reference {reference.get('spp', '?')} spp",
+        provenance=f"{renderer}, reference {spp} spp",
     )
 
 

@@ -28,8 +28,8 @@ LIMIT_BYTES = 20_000_000
 
 MANTISSA_BITS = {"position": 10}
 """Explicit mantissa bits kept of buffers that are rounded further; the largest relative error is 2^-(bits + 1),
-0.05 % of a coordinate, a sixth of a pixel's footprint. Ten bits fit half precision. The source already rounded
-its radiance to eight bits; the effective albedo, being stored, divides and multiplies alike."""
+0.05 % of a coordinate, a sixth of a pixel's footprint. Ten bits fit half precision. The source has its
+radiance rounded to eight bits; the effective albedo, being stored, divides and multiplies alike."""
 
 
 @dataclass(frozen=True)

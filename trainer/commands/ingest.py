@@ -1,0 +1,158 @@
+"""`trainer ingest`: from a published or rendered layout to frames and a manifest."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from data.ingestion import Progress
+    from data.manifest import Manifest
+
+HELP = "read a published or rendered data set into frames and a manifest"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.add_argument("root", type=Path, metavar="ROOT", help="folder of the source")
+    parser.add_argument(
+        "--layout",
+        required=True,
+        help="how the source is arranged: bmfr (BMFR and WSKP data sets) or penumbra (Penumbra's renders)",
+    )
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
+    parser.add_argument(
+        "--test", nargs="+", default=[], metavar="SCENE", help="scenes held out for test (default: the last)"
+    )
+    parser.add_argument(
+        "--validation", nargs="+", default=[], metavar="SCENE", help="scenes held out for validation"
+    )
+    parser.add_argument(
+        "--buffers", nargs="+", metavar="BUFFER", help="store only these buffers (default: all of the source)"
+    )
+    parser.add_argument(
+        "--exposure",
+        default="layout",
+        metavar="layout|auto|NUMBER",
+        help="exposure of the frames: what the layout says (bmfr: 1, penumbra: its sidecar; default), "
+        "from each frame's luminance, or a number",
+    )
+    parser.add_argument("--processes", type=int, metavar="N", help="processes (default: cores, at most 4)")
+    parser.add_argument("--force", action="store_true", help="replace what is in DIR")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ingest and report; returns the exit code.
+
+    Raises:
+        ValueError: The source or an option does not fit, or something is already there.
+        OSError: A file cannot be read or written.
+    """
+    from data.ingestion import IngestOptions, default_processes, ingest
+
+    if args.processes is not None and args.processes < 1:
+        raise ValueError(f"--processes is {args.processes}, expected at least 1")
+    options = IngestOptions(
+        test=tuple(args.test),
+        validation=tuple(args.validation),
+        buffers=None if args.buffers is None else tuple(args.buffers),
+        exposure=args.exposure,
+        force=args.force,
+        processes=args.processes or default_processes(),
+    )
+    with showing("frames") as progress:
+        manifest = ingest(args.layout, args.root, args.output, options, progress)
+    report(manifest, args.output)
+    return 0
+
+
+def report(manifest: Manifest, output: Path) -> None:
+    """Print scenes, splits, and what was derived or repaired."""
+    from rich.console import Console
+
+    console = Console()
+    console.print(scene_table(manifest))
+    stored = dict.fromkeys(b for s in manifest.scenes.values() for f in s.frames for b in f.buffers)
+    console.print(f"stored: {', '.join(stored)}", highlight=False, soft_wrap=True)
+    repaired: Counter[str] = Counter()
+    derived: dict[str, str] = {}
+    for scene in manifest.scenes.values():
+        for frame in scene.frames:
+            repaired.update(frame.repaired)
+            derived |= frame.derived
+    for name, rule in derived.items():
+        console.print(f"derived on reading: {name} = {rule}", highlight=False, soft_wrap=True)
+    for name, count in repaired.items():
+        console.print(f"repaired: {count} pixels of {name} were NaN or Inf", highlight=False, soft_wrap=True)
+    console.print(
+        f"{output}: {manifest.frame_count} frames; next: trainer prepare {output} --output SHARDS",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def scene_table(manifest: Manifest) -> Any:
+    """Return a table with a row per scene: split, frames, size, exposure, samples per pixel."""
+    from rich.table import Table
+
+    table = Table(title=f"{manifest.name} (depth: {manifest.depth})", title_justify="left")
+    for title in ("scene", "split", "frames", "size", "exposure", "spp"):
+        table.add_column(title, overflow="fold")
+    for name, scene in manifest.scenes.items():
+        exposures = [f.exposure for f in scene.frames]
+        low, high = min(exposures), max(exposures)
+        first = scene.frames[0]
+        table.add_row(
+            name,
+            manifest.split_of(name),
+            f"{len(scene.frames)}{'' if scene.sequence else ' views'}",
+            f"{first.width}x{first.height}",
+            f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}",
+            "?" if first.spp is None else str(first.spp),
+        )
+    return table
+
+
+@contextmanager
+def showing(what: str) -> Iterator[Progress]:
+    """Yield a callback that shows progress: a bar on a terminal, otherwise a line every tenth of the way."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(what)
+        return
+    rate = TextColumn("{task.fields[rate]}")
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), rate, TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=console) as bar:
+        task = bar.add_task("", total=None, rate="")
+
+        def update(done: int, total: int, label: str) -> None:
+            speed = bar.tasks[0].speed
+            rate = "" if speed is None else f"{speed:.1f}/s"
+            bar.update(task, completed=done, total=total, description=label, rate=rate)
+
+        yield update
+
+
+def _lines(what: str) -> Progress:
+    import sys
+    import time
+
+    start = time.monotonic()
+
+    def update(done: int, total: int, label: str) -> None:
+        if done == total or done * 10 // total > (done - 1) * 10 // total:
+            elapsed = max(time.monotonic() - start, 1e-9)
+            left = elapsed / done * (total - done)
+            print(
+                f"{what}: {done} of {total}, {done / elapsed:.1f}/s, {left:.0f} s left ({label})",
+                file=sys.stderr,
+            )
+
+    return update

@@ -1,0 +1,172 @@
+"""`trainer inspect`: say what a file, a data set or shards contain."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+HELP = "say what a file, a data set or shards contain"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.add_argument(
+        "path", metavar="PATH", help="an EXR file, a data set, the root of a layout, shards, or sample:bmfr"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what was found; returns 0, or 1 where files do not match their checksums.
+
+    Raises:
+        ValueError: The path is nothing that can be inspected, or damaged.
+        OSError: It does not exist or cannot be read.
+    """
+    from data.inspection import inspect_path
+
+    found = inspect_path(_resolve(args.path))
+    if args.json:
+        print(json.dumps(found, indent=1, ensure_ascii=False))
+    else:
+        from rich.console import Console
+
+        _PRINTERS[found["kind"]](found, Console())
+    return 1 if found.get("problems") else 0
+
+
+def _resolve(name: str) -> Path:
+    if not name.startswith("sample:"):
+        return Path(name)
+    from data.sample import SAMPLES
+
+    known = name.removeprefix("sample:")
+    if known not in SAMPLES:
+        raise ValueError(f"there is no sample {known!r}; there is {', '.join(SAMPLES)}")
+    return SAMPLES[known]
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def _print_frame(found: Mapping[str, Any], console: Console, title: str = "") -> None:
+    _line(console, title or str(found["path"]))
+    _line(
+        console,
+        f"{found['width']}x{found['height']}, scene {found['scene']}, frame {found['frame']}, "
+        f"spp {_known(found['spp'])}, exposure {_known(found['exposure'])}, "
+        f"camera {'yes' if found['camera'] else 'unknown'}"
+        + (", irradiance accumulated" if found["accumulated"] else ""),
+    )
+    console.print(_buffer_table(found["buffers"]))
+    for name, rule in found["derived"].items():
+        _line(console, f"derived: {name} = {rule}")
+    if found["ignored"]:
+        _line(console, f"channels without a meaning here: {', '.join(found['ignored'])}")
+
+
+def _buffer_table(buffers: Mapping[str, Any]) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("buffer", no_wrap=True)
+    table.add_column("from", overflow="fold")
+    table.add_column("type")
+    for title in ("min", "median", "max", "NaN/Inf %", "no hit %"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for name, b in buffers.items():
+        source = _joined(b.get("channels", [])) or "x".join(map(str, b.get("shape", [])))
+        numbers = (b.get("min"), b.get("median"), b.get("max"), b["non_finite_percent"], b["no_hit_percent"])
+        table.add_row(name, source, b["type"], *("" if n is None else f"{n:.3g}" for n in numbers))
+    return table
+
+
+def _joined(channels: list[str]) -> str:
+    """Shorten color.R, color.G, color.B to color.RGB."""
+    layers = {c.rpartition(".")[0] for c in channels}
+    if len(channels) > 1 and len(layers) == 1 and "" not in layers:
+        return f"{layers.pop()}.{''.join(c.rpartition('.')[2] for c in channels)}"
+    return ", ".join(channels)
+
+
+def _print_set(found: Mapping[str, Any], console: Console) -> None:
+    from rich import box
+    from rich.table import Table
+
+    _line(console, f"{found['path']}: data set {found['name']!r}, {found['frames']} frames")
+    _line(console, f"layout {found['layout']}, depth {found['depth']}, hash {found['hash']}")
+    _line(console, "; ".join(f"{split}: {', '.join(s) or 'none'}" for split, s in found["splits"].items()))
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for title in ("scene", "split", "frames", "size", "MB", "exposure", "spp", "licence"):
+        table.add_column(title, overflow="fold")
+    for name, s in found["scenes"].items():
+        low, high = s["exposure"]
+        table.add_row(
+            name,
+            s["split"],
+            f"{s['frames']}{'' if s['sequence'] else ' views'}",
+            f"{s['width']}x{s['height']}",
+            f"{s['bytes'] / 1e6:.2f}",
+            f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}",
+            _known(s["spp"]),
+            s["license"] or "not stated",
+        )
+    console.print(table)
+    for name, s in found["scenes"].items():
+        if s["credit"]:
+            _line(console, f"{name}: {s['credit']}; {s['provenance']}")
+        for buffer, count in s["repaired"].items():
+            _line(console, f"{name}: {count} pixels of {buffer} were NaN or Inf and are repaired")
+    if found["notes"]:
+        _line(console, found["notes"])
+    _print_problems(found, console)
+    for name, frame in found["first_frames"].items():
+        _print_frame(frame, console, f"\n{name}, first frame")
+
+
+def _print_layout(found: Mapping[str, Any], console: Console) -> None:
+    _line(
+        console,
+        f"{found['path']}: layout {found['layout']}, {len(found['scenes'])} scenes, "
+        f"{found['frames']} frames, depth {found['depth']}",
+    )
+    for name, s in found["scenes"].items():
+        limits = ", ".join(f"{k} {v:g}" for k, v in s["thresholds"].items()) or "automatic limits"
+        kind = "sequence" if s["sequence"] else "views"
+        _line(console, f"{name}: {s['frames']} frames, {kind}, {limits}")
+        _print_frame(found["first_frames"][name], console, "first frame")
+
+
+def _print_shards(found: Mapping[str, Any], console: Console) -> None:
+    _line(console, f"{found['path']}: shards of the data set {found['manifest_hash'][:12]}")
+    _line(console, "options: " + ", ".join(f"{k} {v}" for k, v in found["options"].items()))
+    for name, split in found["splits"].items():
+        _line(
+            console,
+            f"{name}: {split['samples']} samples in {split['shards']} shards, {split['bytes'] / 1e6:.1f} MB",
+        )
+        if split["buffers"]:
+            console.print(_buffer_table(split["buffers"]))
+    _print_problems(found, console)
+
+
+def _print_problems(found: Mapping[str, Any], console: Console) -> None:
+    for problem in found["problems"]:
+        _line(console, f"problem: {problem}")
+    if not found["problems"]:
+        _line(console, "checksums: all files match")
+
+
+def _known(value: Any) -> str:
+    return "unknown" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+_PRINTERS = {"file": _print_frame, "data set": _print_set, "layout": _print_layout, "shards": _print_shards}
