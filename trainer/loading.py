@@ -16,6 +16,7 @@ import os
 import pickle
 import re
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -129,7 +130,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ValueError: The file is truncated, not a checkpoint, or holds objects that only pickle could restore.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Detected pickle protocol", UserWarning)  # it is no checkpoint
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         if zipfile.is_zipfile(path):
             reason = (
@@ -138,7 +141,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         else:
             reason = "its content is neither a checkpoint nor an exported model"
         raise ValueError(f"{path} cannot be loaded: {reason}; expected {FORMS}") from error
-    except (RuntimeError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+    except PermissionError:
+        raise
+    except (RuntimeError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         first = (str(error).splitlines() or [repr(error)])[0][:160]
         raise ValueError(f"{path} is truncated or not a checkpoint ({first})") from error
     if not isinstance(content, dict):
@@ -261,14 +266,14 @@ def _from_mlflow(uri: str, device: str, tracking_uri: str | None) -> Loaded:
     import mlflow
     from mlflow.exceptions import MlflowException
 
+    from trainer.export.register import using_store
     from trainer.tracking import quiet_mlflow
 
     quiet_mlflow()
     with tempfile.TemporaryDirectory(prefix="penumbra-") as folder:
         try:
-            place = mlflow.artifacts.download_artifacts(
-                artifact_uri=uri, dst_path=folder, tracking_uri=store, registry_uri=store
-            )
+            with using_store(store):
+                place = mlflow.artifacts.download_artifacts(artifact_uri=uri, dst_path=folder)
         except (MlflowException, OSError) as error:
             first = (str(error).splitlines() or [repr(error)])[0]
             raise ValueError(f"--model {uri}: {first} (store: {store}; `trainer models` lists it)") from error

@@ -16,8 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model",
         required=True,
         metavar="MODEL",
-        help="checkpoint or run folder of `trainer fit`, MLflow URI (runs:/ID/PATH), a published checkpoint, or "
-        "the class name of a denoiser without parameters",
+        help="checkpoint or run folder of `trainer fit`, MLflow URI (runs:/ID/PATH), a published checkpoint, "
+        "or the class name of a denoiser without parameters",
     )
     parser.add_argument(
         "--format",

@@ -31,8 +31,9 @@ def export(
     """Write a denoiser as an ONNX or TorchScript file that agrees with it.
 
     The file takes the denoiser's inputs by name, (B, C, H, W) float32 with any batch and size, and optionally
-    its frame numbers; it returns `color` (B, 3, H, W). Its metadata hold the contract's declarations, the
-    source, the versions and the measured parity (`trainer.export.description.Description`).
+    its frame numbers; it returns `color` (B, 3, H, W), which an ONNX file calls `denoised` where `color` is
+    an input. Its metadata (`trainer.export.description.Description`) hold the contract's declarations, the
+    source, the versions and the measured parity.
 
     Args:
         denoiser: What to export; it is copied and left as it is.

@@ -111,7 +111,7 @@ class _OnnxRuntime:
 
     def __call__(self, feed: dict[str, Tensor]) -> Tensor:
         arrays = {name: np.ascontiguousarray(v.detach().float().cpu().numpy()) for name, v in feed.items()}
-        return torch.from_numpy(self.session.run(["color"], arrays)[0])
+        return torch.from_numpy(self.session.run(None, arrays)[0])
 
 
 class _TorchScript:

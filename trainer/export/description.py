@@ -66,6 +66,7 @@ class Description:
     source: Source
     parity: Parity | None = None
     format: str = "onnx"
+    output: str = "color"
     version: int = FORMAT_VERSION
     versions: dict[str, str] = field(default_factory=dict)
 
@@ -98,6 +99,14 @@ class Description:
             raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
 
 
+def output_name(inputs: tuple[str, ...]) -> str:
+    """Return the name of an ONNX file's output: `color`, or `denoised` where that is an input.
+
+    An ONNX graph cannot have an input and an output of one name.
+    """
+    return "denoised" if "color" in inputs else "color"
+
+
 def describe(denoiser: Denoiser, format: str, source: Source | None) -> Description:
     """Return the description of a denoiser that is about to be exported."""
     cls = type(denoiser)
@@ -112,11 +121,13 @@ def describe(denoiser: Denoiser, format: str, source: Source | None) -> Descript
         per_sample=bool(denoiser.per_sample),
         source=source,
         format=format,
-        versions={name: _version(name) for name in (DISTRIBUTION, "torch", "onnx", "onnxruntime")},
+        output=output_name(tuple(denoiser.inputs)),
+        versions={name: installed_version(name) for name in (DISTRIBUTION, "torch", "onnx", "onnxruntime")},
     )
 
 
-def _version(distribution: str) -> str:
+def installed_version(distribution: str) -> str:
+    """Return the version of a distribution, or that it is not installed."""
     try:
         return version(distribution)
     except PackageNotFoundError:

@@ -1,8 +1,8 @@
 """Export to ONNX.
 
-The graph's inputs carry the buffers' names, the output is `color`; batch, height and width are free. Frame
-numbers are inputs with a default value: an initializer of the same name, which ONNX lets the caller
-override. ONNX Runtime lists them under `get_overridable_initializers()`.
+The graph's inputs carry the buffers' names, the output is `color` (`denoised` where `color` is an input);
+batch, height and width are free. Frame numbers are inputs with a default value: an initializer of the same
+name, which ONNX lets the caller override. ONNX Runtime lists them under `get_overridable_initializers()`.
 
 PyTorch has two exporters. On a convolution, box-filter and softmax network like WSKP (torch 2.13, two CPU
 cores) the one that traces took 0.2 s and gave a file that runs with every batch and size; the one built on
@@ -20,7 +20,7 @@ import onnx
 import torch
 
 from models.denoiser import Denoiser
-from trainer.export.description import KEY, Description
+from trainer.export.description import KEY, Description, output_name
 from trainer.export.entry import Entry, Positional, default, example, tracing
 
 OPSET = 17
@@ -31,8 +31,9 @@ def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
     """Return the ONNX file of a prepared denoiser, and what the tracer doubted."""
     buffers = example(denoiser.inputs, 2, 48, 32)
     given = {name: default(name) for name in denoiser.frame_numbers}
+    output = output_name(tuple(denoiser.inputs))
     free = {0: "batch", 2: "height", 3: "width"}
-    axes = dict.fromkeys((*buffers, "color"), free) | {name: {0: "frames"} for name in given}
+    axes = dict.fromkeys((*buffers, output), free) | {name: {0: "frames"} for name in given}
     entry = Entry(denoiser).eval()
     # Two rows: the tracer would otherwise see a batch of one and leave out broadcasts.
     tensors = tuple(buffers.values()) + tuple(value.repeat_interleave(2, 0) for value in given.values())
@@ -40,7 +41,7 @@ def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
         path = Path(folder) / "model.onnx"
         torch.onnx.export(
             Positional(entry), tensors, path, dynamo=False, opset_version=OPSET,
-            input_names=list(entry.names), output_names=["color"], dynamic_axes=axes,
+            input_names=list(entry.names), output_names=[output], dynamic_axes=axes,
         )  # fmt: skip
         model = onnx.load(path)
     for name, value in given.items():
@@ -54,7 +55,8 @@ def describe_file(content: bytes, description: Description) -> bytes:
     model = onnx.load_model_from_string(content)
     model.producer_name, model.producer_version = "Penumbra", description.versions["penumbra-denoise"]
     model.doc_string = (
-        f"{description.model}: linear radiance (B, 3, H, W) from {', '.join(description.inputs)}. "
+        f"{description.model}: linear radiance `{description.output}` (B, 3, H, W) from "
+        f"{', '.join(description.inputs)}. "
         f"Optional: {', '.join(description.frame_numbers) or 'nothing'}."
     )
     del model.metadata_props[:]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +40,15 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
     Raises:
         ValueError: The file is not an exported ONNX file.
     """
-    import mlflow
     import mlflow.onnx
 
     from trainer.tracking import quiet_mlflow
 
     quiet_mlflow()
     artifact = load_artifact(onnx_path)
-    before = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
-    mlflow.set_tracking_uri(tracking_uri)
-    mlflow.set_registry_uri(tracking_uri)
-    try:
+    with using_store(tracking_uri), warnings.catch_warnings():
+        # MLflow's own classes, at the first import of mlflow.pyfunc.
+        warnings.filterwarnings("ignore", ".*Any type hint is inferred as AnyType", UserWarning)
         info = mlflow.onnx.log_model(
             onnx.load(str(onnx_path)),
             name=name,
@@ -56,11 +58,42 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
             pip_requirements=[f"onnxruntime>={artifact.description.versions['onnxruntime']}", "numpy"],
             save_as_external_data=False,
             run_id=run_id,
+            model_id=_logged_model(run_id, name),
         )
-    finally:
-        mlflow.set_tracking_uri(before[0])
-        mlflow.set_registry_uri(before[1])
     return str(info.registered_model_version)
+
+
+@contextmanager
+def using_store(uri: str) -> Iterator[None]:
+    """Make a store MLflow's current one: several of its functions ignore the URIs that they are given."""
+    import mlflow
+
+    # Setting a URI also sets a variable of the environment, which would outlive this block.
+    variables = {name: os.environ.get(name) for name in ("MLFLOW_TRACKING_URI", "MLFLOW_REGISTRY_URI")}
+    mlflow.set_tracking_uri(uri)
+    mlflow.set_registry_uri(uri)
+    try:
+        yield
+    finally:
+        mlflow.set_tracking_uri(variables["MLFLOW_TRACKING_URI"] or "")
+        mlflow.set_registry_uri(variables["MLFLOW_REGISTRY_URI"] or "")
+        for name, value in variables.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _logged_model(run_id: str, name: str) -> str:
+    """Create the model's entry in the experiment of its run; MLflow would take the default experiment."""
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient()
+    run = client.get_run(run_id)
+    model = client.create_logged_model(
+        run.info.experiment_id, name=name, source_run_id=run_id, params=dict(run.data.params)
+    )
+    return str(model.model_id)
 
 
 def _signature(artifact: Artifact) -> Any:
@@ -74,7 +107,8 @@ def _signature(artifact: Artifact) -> Any:
     if "exposure" in artifact.frame_numbers:
         inputs.append(TensorSpec(single, (-1,), "exposure"))
     return ModelSignature(
-        inputs=Schema(inputs), outputs=Schema([TensorSpec(single, (-1, 3, -1, -1), "color")])
+        inputs=Schema(inputs),
+        outputs=Schema([TensorSpec(single, (-1, 3, -1, -1), artifact.description.output)]),
     )
 
 

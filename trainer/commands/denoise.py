@@ -1,0 +1,239 @@
+"""`trainer denoise`: denoise EXR files, sequences and data sets."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from trainer.clips import Item
+    from trainer.denoising import Result
+
+HELP = "denoise EXR files and sequences"
+_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.add_argument(
+        "paths",
+        nargs="+",
+        metavar="FILE_OR_DIR",
+        help="EXR files, folders of them, ingested data sets, folders of a known layout, or sample:NAME",
+    )
+    parser.add_argument(
+        "--model",
+        required=True,
+        metavar="MODEL",
+        help="checkpoint or run folder, MLflow URI (models:/NAME/VERSION, models:/NAME@ALIAS, "
+        "runs:/ID/PATH), exported .onnx or .ts file, published checkpoint, or class name of a denoiser "
+        "without parameters",
+    )
+    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the results")
+    parser.add_argument(
+        "--png", action="store_true", help="also write tone-mapped pictures, and comparisons with a reference"
+    )
+    parser.add_argument(
+        "--split", choices=("train", "validation", "test"), help="only these scenes of a data set"
+    )
+    parser.add_argument(
+        "--exposure",
+        type=_exposure,
+        metavar="X|auto",
+        help="factor that brings radiance to a displayable level (default: the frame's own, else measured)",
+    )
+    parser.add_argument(
+        "--memory",
+        type=_bytes,
+        default=_bytes("2GB"),
+        metavar="SIZE",
+        help="memory that the model may take, such as 2GB or 500MB; larger images are tiled (default: 2GB)",
+    )
+    parser.add_argument(
+        "--device", default="cpu", metavar="DEVICE", help="cpu, cuda, cuda:1 … (default: cpu)"
+    )
+    parser.add_argument(
+        "--no-accumulate", action="store_true", help="do not accumulate sequences over preceding frames"
+    )
+    parser.add_argument("--force", action="store_true", help="replace results that are already there")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Denoise everything that was named; returns the exit code.
+
+    Raises:
+        ValueError: An input, option or frame is wrong; frames that were finished before stay.
+        OSError: A file cannot be read or written.
+    """
+    from trainer.clips import find_clips
+    from trainer.denoising import ClipDenoiser, Settings
+    from trainer.loading import resolve
+    from trainer.outputs import make_folder, refuse_existing
+
+    clips = find_clips(args.paths, args.split)
+    items = [item for clip in clips for item in clip.items]
+    outputs = [path for item in items for path in _outputs(args.output, item, args.png)]
+    _refuse_inputs(items, outputs)
+    refuse_existing(outputs, args.force)
+    make_folder(args.output)
+    _check_device(args.device)
+    loaded = resolve(args.model, args.device)
+    number = args.exposure if isinstance(args.exposure, float) else None
+    settings = Settings(number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device)
+    with _progress(len(items)) as progress:
+        for clip in clips:
+            denoiser = ClipDenoiser(loaded, clip, settings, progress.say)
+            for item in clip.items:
+                with _naming(item, progress.say):
+                    result = denoiser.step(item.read())
+                _write(result, args.output, item, args.png)
+                progress.advance(item)
+    print(
+        f"{len(items)} frame{'s' * (len(items) != 1)} written to {args.output} ({progress.rate})",
+        file=sys.stderr,
+    )
+    return 0
+
+
+def _exposure(text: str) -> float | str:
+    if text == "auto":
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive number nor 'auto'")
+    return value
+
+
+def _bytes(text: str) -> int:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmg]?i?)b?", text.strip().lower())
+    if match is None or match[2] not in _UNITS or not float(match[1]) > 0:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no size; expected a number with a unit, such as 2GB or 500MB"
+        )
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
+def _outputs(folder: Path, item: Item, png: bool) -> list[Path]:
+    suffixes = (".exr", ".png", "_comparison.png") if png else (".exr",)
+    return [folder / f"{item.name}{suffix}" for suffix in suffixes]
+
+
+def _refuse_inputs(items: list[Item], outputs: list[Path]) -> None:
+    sources = {item.source.resolve() for item in items if item.source is not None}
+    for path in outputs:
+        if path.resolve() in sources:
+            raise ValueError(f"{path} is an input; choose another --output")
+
+
+def _check_device(device: str) -> None:
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"--device {device}: expected cpu, cuda or cuda:NUMBER") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            f"--device {device}: no CUDA device, or a build of PyTorch without CUDA; use --device cpu"
+        )
+
+
+@contextmanager
+def _naming(item: Item, say: Callable[[str], None]) -> Iterator[None]:
+    """Name the frame in every error, and show warnings of readers as remarks."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            text = str(error)
+            raise type(error)(text if item.label in text else f"{item.label}: {text}") from error
+    for warning in caught:
+        say(str(warning.message))
+
+
+def _write(result: Result, folder: Path, item: Item, png: bool) -> None:
+    from data.exr import write_frame
+    from trainer.outputs import replacing
+    from trainer.reports.pictures import comparison, tone_map
+
+    exr, *pictures = _outputs(folder, item, png)
+    exr.parent.mkdir(parents=True, exist_ok=True)
+    color = result.frame.buffers["color"]
+    if png:
+        images = [tone_map(color, result.exposure)]
+        if result.reference is not None:
+            title = f"{result.frame.label}, exposure {result.exposure:.4g}"
+            images.append(
+                comparison(result.noisy, result.accumulated, color, result.reference, result.exposure, title)
+            )
+        for path, image in zip(pictures, images, strict=False):
+            with replacing(path) as temporary:
+                image.save(temporary, optimize=True)
+    write_frame(result.frame, exr)  # last: a frame with its EXR is finished
+
+
+class _Progress:
+    """A bar with rate and remaining time on a terminal, plain lines otherwise."""
+
+    def __init__(self, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.total, self.done, self.start = total, 0, time.monotonic()
+        self.said: set[str] = set()
+        console = Console(stderr=True)
+        self.bar: Progress | None = None
+        if console.is_terminal:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"),
+                TimeRemainingColumn(),
+            )
+            self.bar = Progress(*columns, console=console)
+            self.task = self.bar.add_task("denoising", total=total, rate="")
+
+    @property
+    def rate(self) -> str:
+        """Frames per second since the start."""
+        return f"{self.done / max(time.monotonic() - self.start, 1e-9):.2f} frames/s"
+
+    def say(self, text: str) -> None:
+        """Show a remark, once."""
+        if text in self.said:
+            return
+        self.said.add(text)
+        if self.bar is not None:
+            self.bar.console.print(f"note: {text}", highlight=False)
+        else:
+            print(f"note: {text}", file=sys.stderr)
+
+    def advance(self, item: Item) -> None:
+        """Count a frame."""
+        self.done += 1
+        if self.bar is not None:
+            self.bar.update(self.task, advance=1, description=item.name, rate=self.rate)
+        else:
+            print(f"{self.done}/{self.total} {item.name} ({self.rate})", file=sys.stderr)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[_Progress]:
+    progress = _Progress(total)
+    if progress.bar is None:
+        yield progress
+        return
+    with progress.bar:
+        yield progress
