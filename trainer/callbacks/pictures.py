@@ -8,6 +8,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from trainer.modules.regression import noisy_input
+from trainer.reports.pictures import comparison
 from trainer.tracking import MLflowTracking
 
 
@@ -54,6 +55,9 @@ class ValidationPictures(Callback):
             self._seen[scene] = number + 1
             picture = self._strip(pl_module, batch, row)
             logger.log_picture(picture, key=f"validation/{scene}-{number}", step=trainer.global_step)
+            folder = logger.folder / "pictures"
+            folder.mkdir(exist_ok=True)
+            picture.save(folder / f"step{trainer.global_step:06}-{scene}-{number}.png")
 
     def _due(self, trainer: Trainer) -> bool:
         if trainer.sanity_checking or trainer.state.fn != "fit":
@@ -63,8 +67,6 @@ class ValidationPictures(Callback):
 
     @torch.no_grad()
     def _strip(self, module: LightningModule, batch: dict[str, Any], row: int) -> Any:
-        from trainer.reports.pictures import comparison
-
         one = {k: v[row : row + 1] for k, v in batch.items() if isinstance(v, torch.Tensor)}
         images = {
             "noisy": one.get("color"),
@@ -76,4 +78,5 @@ class ValidationPictures(Callback):
             name: None if image is None else image[0].float().permute(1, 2, 0).cpu().numpy()
             for name, image in images.items()
         }
-        return comparison(**arrays, exposure=float(one["exposure"][0]))
+        place = f"{batch['scene'][row]}, frame {int(batch['frame'][row])}"
+        return comparison(**arrays, exposure=float(one["exposure"][0]), title=place)  # type: ignore[arg-type]

@@ -1,0 +1,52 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+class Workplace:
+    """An empty folder in which a newcomer runs the `trainer` command."""
+
+    def __init__(self, folder: Path, cache: Path) -> None:
+        self.folder = folder
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
+        # One thread for each process: results do not depend on the load of the machine either way, and
+        # tests that run several processes do not fight for cores.
+        self.environment = environment | {"OMP_NUM_THREADS": "1", "PENUMBRA_CACHE": str(cache)}
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "trainer", *arguments], cwd=self.folder, env=self.environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+
+    def trainer(self, *arguments: str, code: int = 0) -> str:
+        process = self.start(*arguments)
+        output, _ = process.communicate(timeout=500)
+        assert process.returncode == code, output
+        return output
+
+    @property
+    def runs(self) -> list[Path]:
+        return sorted(p.parent for p in self.folder.glob("runs/*/*/run.json"))
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Shards of the shipped sample are prepared once for all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def workplace(tmp_path, cache):
+    return Workplace(tmp_path, cache)
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory, cache):
+    """A workplace in which the smoke configuration was trained, with what the command printed."""
+    place = Workplace(tmp_path_factory.mktemp("trained"), cache)
+    place.printed = place.trainer("fit", "--config", "wskp_bmfr.yaml", "--config", "smoke.yaml")
+    return place
