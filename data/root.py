@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from data.manifest import MANIFEST
+from data.sample import SAMPLES
 from data.shards.index import INDEX
 
 SAMPLE = "sample:"
@@ -24,16 +25,6 @@ class Root:
 
     kind: Literal["frames", "shards"]
     path: Path
-
-
-def sample_folder() -> Path:
-    """Return the folder of the data sets that ship with the package."""
-    return Path(__file__).resolve().parent / "sample"
-
-
-def samples() -> list[str]:
-    """Return the names of the data sets that ship."""
-    return sorted(path.parent.name for path in sample_folder().glob(f"*/{MANIFEST}"))
 
 
 def resolve_root(root: str | Path) -> Root:
@@ -63,19 +54,19 @@ def resolve_root(root: str | Path) -> Root:
         what = "is a file" if path.exists() else "does not exist"
         raise FileNotFoundError(
             f"data root {path} {what}; name a folder made by `trainer ingest` or `trainer prepare`, or "
-            f"{' or '.join(SAMPLE + name for name in samples()) or 'a sample'}"
+            f"{' or '.join(SAMPLE + name for name in SAMPLES)}"
         )
     raise ValueError(_advice(path))
 
 
 def _sample(name: str) -> Root:
-    known = samples()
+    known = list(SAMPLES)
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {SAMPLE}{near[0]}? " if near else ""
-        listed = ", ".join(SAMPLE + other for other in known) or "none is installed"
+        listed = ", ".join(SAMPLE + other for other in known)
         raise FileNotFoundError(f"there is no data set {SAMPLE}{name}; {hint}known: {listed}")
-    return Root("frames", sample_folder() / name)
+    return Root("frames", SAMPLES[name])
 
 
 def _advice(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -108,7 +109,8 @@ class ShardWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):  # what it could not write was reported already
+                self._file.close()
         self.temporary.unlink(missing_ok=True)
 
     def add(self, meta: Mapping[str, Any], arrays: Mapping[str, Image]) -> None:

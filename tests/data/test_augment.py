@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from data.augment import LEFT, RIGHT, Augmentation, Turn, turn_vectors, turned
+
+IMAGE = np.arange(2 * 4 * 4, dtype=np.float32).reshape(2, 4, 4)
+
+
+def test_turns_are_the_flips_and_quarter_turns_of_numpy():
+    assert np.array_equal(turned(IMAGE, Turn.FLIP_X), np.flip(IMAGE, 2))
+    assert np.array_equal(turned(IMAGE, Turn.FLIP_Y), np.flip(IMAGE, 1))
+    assert np.array_equal(turned(IMAGE, LEFT), np.rot90(IMAGE, 1, (1, 2)))
+    assert np.array_equal(turned(IMAGE, RIGHT), np.rot90(IMAGE, -1, (1, 2)))
+
+
+def test_the_eight_turns_are_all_different():
+    assert len({turned(IMAGE, Turn(bits)).tobytes() for bits in range(8)}) == 8
+
+
+@pytest.mark.parametrize("bits", range(8))
+def test_motion_points_at_the_same_pixel_after_a_turn(bits: int):
+    # A vector field that points from each pixel to the pixel with number 6 (row 1, column 2).
+    rows, columns = np.mgrid[0:4, 0:4].astype(np.float32)
+    field = np.stack([2 - columns, 1 - rows])
+    number = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
+    turn = Turn(bits)
+    vectors, target = turned(field, turn).copy(), turned(number, turn)
+    turn_vectors(vectors, turn)
+    reached = np.round(np.stack([columns, rows]) + vectors).astype(int)
+    assert (target[0][reached[1], reached[0]] == 6).all()
+
+
+def test_quarter_turns_need_square_patches():
+    with pytest.raises(ValueError, match="needs a square patch, got 6x4"):
+        turned(np.zeros((1, 4, 6), np.float32), LEFT)
+
+
+def test_wskp_rule_leaves_half_alone_and_turns_the_rest_in_four_ways_equally():
+    drawn = Counter(Augmentation("wskp", seed=3).turn(epoch, s) for epoch in range(20) for s in range(1000))
+    assert set(drawn) == {Turn.NONE, Turn.FLIP_X, Turn.FLIP_Y, LEFT, RIGHT}
+    assert abs(drawn[Turn.NONE] / 20000 - 0.5) < 0.02
+    assert all(abs(drawn[turn] / 20000 - 0.125) < 0.01 for turn in (Turn.FLIP_X, Turn.FLIP_Y, LEFT, RIGHT))
+
+
+def test_dihedral_rule_draws_all_eight_equally():
+    drawn = Counter(Augmentation("dihedral").turn(0, sample) for sample in range(16000))
+    assert len(drawn) == 8
+    assert all(abs(count / 16000 - 0.125) < 0.01 for count in drawn.values())
+
+
+def test_augmentation_follows_from_seed_epoch_and_sample_alone():
+    first = [Augmentation(seed=5, exposure_stops=2).turn(1, s) for s in range(64)]
+    assert first == [Augmentation(seed=5).turn(1, s) for s in range(64)]
+    assert first != [Augmentation(seed=6).turn(1, s) for s in range(64)]
+    assert first != [Augmentation(seed=5).turn(2, s) for s in range(64)]
+
+
+def test_exposure_varies_within_the_given_stops_evenly():
+    factors = np.log2([Augmentation(exposure_stops=1.5).exposure_factor(0, s) for s in range(4000)])
+    assert -1.5 <= factors.min() < -1.45
+    assert 1.45 < factors.max() <= 1.5
+    assert abs(factors.mean()) < 0.05
+    assert Augmentation().exposure_factor(0, 0) == 1.0
+
+
+def test_unknown_rules_and_negative_stops_are_refused():
+    with pytest.raises(ValueError, match="expected wskp, dihedral or none"):
+        Augmentation("mirror")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected 0 to 16"):
+        Augmentation(exposure_stops=-1)
