@@ -219,7 +219,11 @@ def _is_reflectance(image: ExrImage, layers: Mapping[str, Mapping[str, str]]) ->
         return False
     if {"specular", "roughness"} <= layers.keys():
         return True
-    return any((image.channels[c] <= 0).any() for c in layers["albedo"].values())
+    return any(
+        (image.channels[c][~image.outside[c]] if c in image.outside else image.channels[c]).min(initial=1)
+        <= 0
+        for c in layers["albedo"].values()
+    )
 
 
 def _by_file_name(path: Path, layers: Mapping[str, Any]) -> str:

@@ -1,8 +1,9 @@
 """OpenEXR files as plain channels: what the library returns, checked, composed, written whole or not.
 
 Traps of the library (OpenEXR 3.3 to 3.5, its Python module) that this file deals with: channels X, Y, Z are
-merged unless asked not to; a file with damaged pixels raises nothing, prints a line and has fewer parts; the
-dictionary given for writing is modified; pixels outside the data window are the reader's business.
+merged unless asked not to; the dictionary given for writing is modified, strides of its arrays are ignored; a
+file with damaged pixels raises nothing, prints a line and has fewer parts; headers are emptied when the file
+is closed; pixels outside the data window are the reader's business.
 """
 
 from __future__ import annotations
@@ -178,22 +179,19 @@ def _pixels(part: Any, path: Path) -> dict[str, NDArray[Any]]:
 def _compose(path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArray[Any]]]]) -> ExrImage:
     several = len(parts) > 1
     image = ExrImage(path, {}, {}, _attributes(parts[0][1]), [name for name, _, _ in parts])
-    sizes = set()
     for part, header, pixels in parts:
         (left, top), (right, bottom) = (np.asarray(v).tolist() for v in header["displayWindow"])
-        sizes.add((bottom - top + 1, right - left + 1))
+        size = (bottom - top + 1, right - left + 1)
         for name, array in pixels.items():
             full = f"{part}.{name}" if several and part and "." not in name else name
             if full in image.channels:
                 full = f"{part}.{name}"
             origin = np.asarray(header["dataWindow"][0]) - (left, top)
-            placed, outside = _place(array, int(origin[0]), int(origin[1]), max(sizes))
+            placed, outside = _place(array, int(origin[0]), int(origin[1]), size)
             image.channels[full] = placed
             image.precision[full] = {"float16": "half", "float32": "float"}.get(array.dtype.name, "uint")
             if outside is not None:
                 image.outside[full] = outside
-    if len(sizes) > 1:
-        raise ValueError(f"{path}: parts of different size: {sorted(sizes)} (height, width)")
     return image
 
 

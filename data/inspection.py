@@ -48,8 +48,8 @@ def inspect_path(path: str | Path) -> dict[str, Any]:
     name = likeliest(path)
     if name is None:
         raise ValueError(
-            f"{path} is neither an EXR file, an ingested data set ({MANIFEST}), prepared shards ({INDEX}), nor "
-            f"a folder in one of the layouts {', '.join(LAYOUTS)}"
+            f"{path} is neither an EXR file, an ingested data set ({MANIFEST}), prepared shards ({INDEX}), "
+            f"nor a folder in one of the layouts {', '.join(LAYOUTS)}"
         )
     return _layout(path, name)
 

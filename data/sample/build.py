@@ -27,9 +27,9 @@ TEST = "living-room-2"
 LIMIT_BYTES = 20_000_000
 
 MANTISSA_BITS = {"position": 10}
-"""Explicit mantissa bits kept of buffers that are rounded further; the largest relative error is 2^-(bits + 1),
-0.05 % of a coordinate, a sixth of a pixel's footprint. Ten bits fit half precision. The source has its
-radiance rounded to eight bits; the effective albedo, being stored, divides and multiplies alike."""
+"""Explicit mantissa bits kept of buffers that are rounded further than in the source. The largest relative
+error is 2^-(bits + 1): 0.05 % of a coordinate, a sixth of a pixel's footprint; ten bits fit half precision.
+The effective albedo, being stored, divides and multiplies alike."""
 
 
 @dataclass(frozen=True)
