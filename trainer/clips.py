@@ -18,6 +18,7 @@ from data.exr import read_frame
 from data.frame import Frame
 from data.frames import FrameSet
 from data.layouts import layout, likeliest
+from data.root import SAMPLE, resolve_root
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def find_clips(paths: Iterable[str], split: str | None = None) -> list[Clip]:
     clips: list[Clip] = []
     files: dict[Path, list[Path]] = {}
     for given in paths:
-        path = _sample(given) if given.startswith("sample:") else Path(given)
+        path = resolve_root(given).path if given.startswith(SAMPLE) else Path(given).expanduser()
         if not path.exists():
             raise FileNotFoundError(f"{given}: no such file or folder")
         if path.is_file():
@@ -85,17 +86,6 @@ def find_clips(paths: Iterable[str], split: str | None = None) -> list[Clip]:
     ]
     _refuse_same_names(clips)
     return clips
-
-
-def _sample(given: str) -> Path:
-    import data
-
-    folder = Path(data.__file__).parent / "sample"
-    name = given.removeprefix("sample:")
-    known = sorted(p.parent.name for p in folder.glob("*/manifest.json"))
-    if name not in known:
-        raise FileNotFoundError(f"{given}: no such sample; there is {', '.join(known) or 'none'}")
-    return folder / name
 
 
 def _folder(path: Path, split: str | None) -> list[Clip]:

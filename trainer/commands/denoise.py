@@ -179,7 +179,7 @@ def _write(result: Result, folder: Path, item: Item, png: bool) -> None:
             )
         for path, image in zip(pictures, images, strict=False):
             with replacing(path) as temporary:
-                image.save(temporary, optimize=True)
+                image.save(temporary)
     write_frame(result.frame, exr)  # last: a frame with its EXR is finished
 
 

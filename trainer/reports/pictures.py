@@ -177,7 +177,8 @@ def _score(name: str, image: Array, reference: Array, exposure: float) -> str:
     from trainer.metrics.functional import psnr_wskp, ssim_wskp
 
     def exposed(array: Array) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array * np.float32(exposure))).permute(2, 0, 1)[None]
+        planes = (array * np.float32(exposure)).transpose(2, 0, 1)
+        return torch.from_numpy(np.ascontiguousarray(planes))[None]
 
     output, target = exposed(image), exposed(reference)
     text = f"PSNR {float(psnr_wskp(output, target)):.2f} dB"
