@@ -1,6 +1,7 @@
 """The authors' published weights → our modules.
 
-The functions take state dicts, not files: load a checkpoint with `torch.load(path, weights_only=True)`.
+The functions take state dicts, not files: load a checkpoint with
+`torch.load(path, weights_only=True, map_location="cpu")`.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Window sums of exp(map), for maps of any range.
 
 exp overflows above 88, and one common shift underflows whole windows to 0 / 0 as soon as a map spans more
-than about 90, while a shift per window cannot be shared by window sums. So a map is cut into bands of 64,
-measured down from its largest value. Within a band exp stays in e**-32 … e**32; every band gets window
-sums of its own, and a pixel combines them relative to the highest band that its window holds. That is
-exact for every finite map. A map that spans less than 64, the common case, has one band and costs nothing
-extra; bands without pixels are skipped.
+than about 150, while a shift per window cannot be shared by window sums. (The published weights of WSKP
+reach a span of 122 on one-sample frames.) So a map is cut into bands of 112, measured down from its largest
+value. Within a band exp stays in e**-56 … e**56; every band gets window sums of its own, and a pixel combines
+them relative to the highest band that its window holds. That is exact for every finite map. A map that
+spans less than 112, the common case, has one band and costs nothing extra; bands without pixels are skipped.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from torch import Tensor
 
 from models.ops.boxes import box_sum_valid
 
-SPAN = 64.0
-"""Width of a band: e**(+-32) times radiance up to 1e9 times 169 pixels stays well inside float32."""
+SPAN = 112.0
+"""Width of a band. Sums over 169 pixels of e**56 times radiance up to 1e9, and gradients down to 1e-11
+divided by them, are normal numbers of float32."""
 
 
 class LogMap(NamedTuple):
@@ -42,7 +43,7 @@ class LogMap(NamedTuple):
         if len(self.bands) == 1:
             return shifted.exp_()
         inside = ((self.top - values) / SPAN).floor_() == band
-        return torch.where(inside, shifted.clamp_(-SPAN, SPAN).exp_(), 0.0)
+        return torch.where(inside, shifted.clamp_(-SPAN / 2 - 1, SPAN / 2 + 1).exp_(), 0.0)
 
 
 class Window(NamedTuple):
@@ -83,7 +84,9 @@ def window_sums(irradiance: Tensor, log_map: LogMap, size: int, start: int, stop
     for band in lower:
         below = _band_sums(irradiance, log_map, band, size, (start, stop))
         empty = sums[:, 3:] == 0
-        sums = sums + below * torch.where(empty, 1.0, torch.exp(SPAN * (highest - band)))
+        # e**-SPAN alone would underflow: its root is applied twice.
+        root = torch.where(empty, 1.0, torch.exp(SPAN / 2 * (highest - band)))
+        sums = sums + below * root * root
         highest = torch.where(empty, float(band), highest)
     return Window(sums, highest)
 
@@ -108,5 +111,5 @@ def to_band(adjoint: Tensor, highest: Tensor | None, band: int) -> Tensor:
     """
     if highest is None:
         return adjoint
-    scale = torch.exp((SPAN * (highest - band)).clamp_max(0.0))
-    return adjoint * torch.where(highest <= band, scale, 0.0)
+    root = torch.exp((SPAN / 2 * (highest - band)).clamp_max(0.0))
+    return adjoint * torch.where(highest <= band, root, 0.0) * root

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from models.ops import sharing
 from models.ops.sharing import reconstruct, reconstruct_by_softmax
-from models.ops.window import log_maps
+from models.ops.window import SPAN, log_maps
 from tests.models.frames import largest_relative
 
 SIZES = (3, 5, 7, 9, 11, 13)
@@ -39,16 +39,23 @@ def step(low: float, high: float) -> Callable[[Tensor], Tensor]:
     return shift
 
 
+def stretched(maps: Tensor, span: float) -> Tensor:
+    low, high = maps.amin((-2, -1), keepdim=True), maps.amax((-2, -1), keepdim=True)
+    return (maps - low) / (high - low) * span
+
+
 RANGES: dict[str, Callable[[Tensor], Tensor]] = {
     "narrow": lambda maps: maps,
-    "just inside one band": lambda maps: maps.clamp(-10, 10) * 3.19,
-    "just over one band": lambda maps: maps.clamp(-10, 10) * 3.21,
+    "just inside one band": lambda maps: stretched(maps, SPAN - 1),
+    "just over one band": lambda maps: stretched(maps, SPAN + 1),
     "left -200, right +200": step(-200.0, 200.0),
     "left +1000, right -1000": step(1000.0, -1000.0),
     "noise of +-1000": lambda maps: maps * 300,
     "one pixel at +1e5": lambda maps: maps + 1e5 * (maps == maps.amax((-2, -1), keepdim=True)),
     "maps far from each other": lambda maps: maps + torch.tensor([0, 0, 900.0, 0, -900, 0])[:, None, None],
-    "ramp over ten bands": lambda maps: maps + torch.linspace(-320, 320, maps.shape[-1], dtype=maps.dtype),
+    "ramp over ten bands": lambda maps: (
+        maps + torch.linspace(-5 * SPAN, 5 * SPAN, maps.shape[-1], dtype=maps.dtype)
+    ),
 }
 
 
@@ -156,13 +163,13 @@ def test_low_precision_input_is_computed_in_float32() -> None:
 
 
 def test_a_map_within_one_band_is_summed_once() -> None:
-    (found,) = log_maps(torch.rand(1, 1, 16, 16) * 60)
+    (found,) = log_maps(torch.rand(1, 1, 16, 16) * (SPAN - 1))
     assert found.bands == [0]
 
 
 def test_bands_without_pixels_are_skipped() -> None:
     stack = torch.zeros(1, 1, 16, 16)
-    stack[..., 8:] = 6400.0
+    stack[..., 8:] = 100 * SPAN
     (found,) = log_maps(stack)
     assert found.bands == [0, 100]
 
@@ -176,7 +183,7 @@ def test_an_exported_graph_is_exact_to_128_and_finite_beyond() -> None:
     with pytest.warns(DeprecationWarning, match="torch.jit.trace"):
         traced = torch.jit.trace(run, sample)
     irradiance, log_importance, fusion = (t.float() for t in random_maps(23, 18))
-    within = RANGES["ramp over ten bands"](log_importance) / 6
+    within = stretched(log_importance, 127.0)
     expected = reconstruct_by_softmax(irradiance, within, fusion, SIZES)
     torch.testing.assert_close(traced(irradiance, within, fusion), expected, rtol=1e-5, atol=1e-6)
     beyond = RANGES["left +1000, right -1000"](log_importance)
