@@ -36,7 +36,7 @@ HEIGHT, WIDTH = 26, 38
 class Radiance(Denoiser):
     """Returns irradiance times albedo, so that what went in can be seen in what comes out."""
 
-    inputs = ("irradiance", "albedo", "normal", "depth")
+    inputs: tuple[str, ...] = ("irradiance", "albedo", "normal", "depth")
     temporal = True
 
     def forward(self, buffers: Buffers) -> Denoised:
@@ -78,7 +78,7 @@ def frame(index: int, seed: int = 0, scene: str = "wall") -> Frame:
     buffers = {
         "color": albedo * noise * 4,
         "diffuse_albedo": albedo,
-        "normal": np.broadcast_to(np.float32([0, 0, -1]), (HEIGHT, WIDTH, 3)).copy(),
+        "normal": np.broadcast_to(np.array([0, 0, -1], np.float32), (HEIGHT, WIDTH, 3)).copy(),
         "position": position,
         "reference": albedo * 4,
     }
