@@ -42,6 +42,7 @@ class Denoiser(nn.Module):
         multiple: Height and width must divide by it; the tiler pads.
         temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
         per_sample: Buffers carry a sample axis (B, S, C, H, W).
+        bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
     """
 
     inputs: tuple[str, ...] = ()
@@ -50,6 +51,7 @@ class Denoiser(nn.Module):
     multiple: int = 1
     temporal: bool = False
     per_sample: bool = False
+    bytes_per_pixel: int = 1500
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise a batch of images.

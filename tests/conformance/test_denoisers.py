@@ -1,0 +1,248 @@
+"""What every denoiser in `models.__all__` promises."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import models
+from data.buffers import BUFFERS, FRAME_NUMBERS, buffer
+from models.denoiser import Denoiser, select
+from models.tiling import denoise_tiled
+from tests.models.frames import largest_relative, luminous, random_buffers
+
+KERNEL_METHODS = {"WSKP", "JointBilateral"}
+"""Outputs are convex combinations of input pixels: a constant image stays constant."""
+
+
+@pytest.fixture(params=models.__all__)
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def denoiser(name: str) -> Denoiser:
+    torch.manual_seed(7)
+    made: Denoiser = getattr(models, name)()
+    return made.eval()
+
+
+def inputs(
+    denoiser: Denoiser, batch: int = 1, height: int = 32, width: int = 40, seed: int = 0
+) -> dict[str, Tensor]:
+    """Random buffers for a method, with the frame numbers that it reads."""
+    everything = random_buffers(batch, height, width, seed)
+    everything["color"] = everything["irradiance"] * everything["albedo"]
+    numbers = {"exposure": torch.ones(batch), "depth_range": torch.tensor([[1.0, 6.0]]).repeat(batch, 1)}
+    return select(denoiser, {**everything, **numbers})
+
+
+def test_the_catalogue_lists_exactly_the_denoisers() -> None:
+    found = {
+        key
+        for key, value in vars(models).items()
+        if isinstance(value, type) and issubclass(value, Denoiser) and value is not Denoiser
+    }
+    assert set(models.__all__) == found
+
+
+def test_declarations_are_in_the_vocabulary(denoiser: Denoiser) -> None:
+    assert denoiser.inputs
+    assert set(denoiser.inputs) <= set(BUFFERS)
+    assert set(denoiser.frame_numbers) <= set(FRAME_NUMBERS)
+    assert denoiser.halo >= 0
+    assert denoiser.multiple >= 1
+    assert denoiser.bytes_per_pixel > 0
+    assert set(denoiser.measure(inputs(denoiser))) <= set(denoiser.frame_numbers)
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (17, 31), (31, 17), (16, 129), (50, 33)])
+def test_the_output_has_the_size_of_the_input(denoiser: Denoiser, height: int, width: int) -> None:
+    with torch.no_grad():
+        result = denoiser(inputs(denoiser, 2, height, width))
+    assert result.color.shape == (2, 3, height, width)
+    assert result.color.dtype == torch.float32
+    assert result.color.isfinite().all()
+    assert result.state is None
+
+
+@pytest.mark.parametrize("value", [0.3, 1000.0])
+def test_constant_irradiance_stays_constant_borders_included(
+    denoiser: Denoiser, name: str, value: float
+) -> None:
+    if name not in KERNEL_METHODS:
+        return
+    buffers = luminous(inputs(denoiser, 1, 33, 29), value)
+    with torch.no_grad():
+        found = denoiser(buffers).color / buffers["albedo"]
+    torch.testing.assert_close(found, torch.full_like(found, value), rtol=1e-5, atol=0)
+
+
+def extreme(kind: str, buffers: dict[str, Tensor]) -> dict[str, Tensor]:
+    noisy = buffers["irradiance"].clone()
+    if kind == "black":
+        return {key: torch.zeros_like(value) for key, value in buffers.items() if key not in FRAME_NUMBERS}
+    if kind == "bright":
+        return luminous(buffers, 65504.0)
+    if kind == "fireflies":
+        noisy[..., ::7, ::5] = 65504.0
+    if kind == "one firefly in black":
+        noisy = torch.zeros_like(noisy)
+        noisy[..., 9, 11] = 1e9
+    return {**buffers, "irradiance": noisy}
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("kind", ["black", "bright", "fireflies", "one firefly in black"])
+def test_extreme_inputs_stay_finite_with_finite_gradients(
+    denoiser: Denoiser, kind: str, precision: str
+) -> None:
+    buffers = extreme(kind, inputs(denoiser))
+    with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
+        color = denoiser(buffers).color
+    assert color.dtype == torch.float32
+    assert color.isfinite().all()
+    if any(True for _ in denoiser.parameters()):
+        color.mean().backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in denoiser.parameters())
+
+
+def test_every_parameter_has_a_gradient(denoiser: Denoiser) -> None:
+    denoiser.train()
+    if not any(True for _ in denoiser.parameters()):
+        return
+    buffers = inputs(denoiser, 2)
+    weights = torch.rand(2, 3, 32, 40)
+    (denoiser(buffers).color * weights).mean().backward()
+    for key, parameter in denoiser.named_parameters():
+        assert parameter.grad is not None, key
+        assert parameter.grad.abs().max() > 0, key
+
+
+def test_the_noisy_image_has_a_finite_gradient(denoiser: Denoiser) -> None:
+    buffers = inputs(denoiser)
+    buffers["irradiance"][..., :8, :8] = 0.0
+    buffers["irradiance"].requires_grad_()
+    denoiser(buffers).color.sum().backward()
+    assert buffers["irradiance"].grad is not None
+    assert buffers["irradiance"].grad.isfinite().all()
+    assert buffers["irradiance"].grad.abs().max() > 0
+
+
+def test_a_batch_element_never_influences_another(denoiser: Denoiser) -> None:
+    one, other = inputs(denoiser, 1, seed=1), extreme("fireflies", inputs(denoiser, 1, seed=2))
+    together = {key: torch.cat([one[key], other[key]]) for key in one}
+    with torch.no_grad():
+        alone, first = denoiser(one).color, denoiser(together).color[:1]
+    assert largest_relative(first, alone) < 1e-6
+
+
+def test_the_deployed_form_is_equal(denoiser: Denoiser) -> None:
+    buffers = inputs(denoiser, 2, 40, 37)
+    with torch.no_grad():
+        expected = denoiser(buffers).color
+        assert largest_relative(denoiser.deploy()(buffers).color, expected) < 1e-5
+    deployed = denoiser.deploy()
+    for attribute in ("inputs", "frame_numbers", "halo", "multiple", "temporal", "per_sample"):
+        assert getattr(deployed, attribute) == getattr(denoiser, attribute)
+
+
+def test_tiled_equals_untiled(denoiser: Denoiser) -> None:
+    buffers = inputs(denoiser, 2, 61, 75)
+    buffers.pop("depth_range", None)  # left to `measure`, which sees the whole frame
+    with torch.no_grad():
+        expected = denoiser(buffers).color
+        assert largest_relative(denoise_tiled(denoiser, buffers, tile=32), expected) < 1e-5
+
+
+def sensitive(denoiser: Denoiser) -> Denoiser:
+    """The same network with gains that carry influence through every layer to the rim of the halo."""
+    network = copy.deepcopy(denoiser).double()
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.uniform_(module.weight, -0.3, 0.3)
+    return network
+
+
+def test_the_halo_is_the_reach_no_more_and_no_less(denoiser: Denoiser) -> None:
+    network, halo = sensitive(denoiser), denoiser.halo
+    size = 2 * halo + 7
+    buffers = {key: value.double() for key, value in inputs(denoiser, 1, size, size).items()}
+    images = [buffers[key] for key in denoiser.inputs]
+    for image in images:
+        image.requires_grad_()
+    centre = size // 2
+    gradients = torch.autograd.grad(
+        network(buffers).color[..., centre, centre].sum(), images, allow_unused=True
+    )
+    reached = torch.zeros(size, size, dtype=torch.bool)
+    for gradient in gradients:
+        if gradient is not None:
+            reached |= (gradient[0].abs() > 0).any(0)
+    rows, columns = reached.nonzero().unbind(1)
+    assert centre - int(rows.min()) == halo
+    assert int(rows.max()) - centre == halo
+    assert centre - int(columns.min()) == halo
+    assert int(columns.max()) - centre == halo
+
+
+def test_the_state_dict_round_trips(denoiser: Denoiser, name: str) -> None:
+    torch.manual_seed(99)
+    other: Denoiser = getattr(models, name)().eval()
+    other.load_state_dict(denoiser.state_dict())
+    buffers = inputs(denoiser)
+    with torch.no_grad():
+        assert torch.equal(other(buffers).color, denoiser(buffers).color)
+
+
+def test_a_missing_buffer_is_named(denoiser: Denoiser) -> None:
+    for missing in denoiser.inputs:
+        buffers = inputs(denoiser)
+        del buffers[missing]
+        with pytest.raises(ValueError, match=f"missing: {missing}"):
+            denoiser(buffers)
+
+
+def test_a_buffer_of_another_shape_is_named(denoiser: Denoiser) -> None:
+    last = denoiser.inputs[-1]
+    wrong: dict[str, Any] = {
+        "size": torch.rand(1, buffer(last).channels, 32, 41),
+        "channels": torch.rand(1, buffer(last).channels + 1, 32, 40),
+        "batch": torch.rand(2, buffer(last).channels, 32, 40),
+        "rank": torch.rand(buffer(last).channels, 32, 40),
+    }
+    for tensor in wrong.values():
+        with pytest.raises(ValueError, match=f"buffer '{last}' has shape .* expected"):
+            denoiser({**inputs(denoiser), last: tensor})
+
+
+def test_radiance_in_other_units_comes_back_in_those_units(denoiser: Denoiser) -> None:
+    buffers = inputs(denoiser)
+    with torch.no_grad():
+        expected = denoiser(buffers).color
+        scaled = {**buffers, "irradiance": buffers["irradiance"] * 50}
+        if "exposure" in denoiser.frame_numbers:
+            scaled["exposure"] = torch.tensor([1 / 50])
+        assert largest_relative(denoiser(scaled).color / 50, expected) < 1e-5
+
+
+def test_a_traced_module_runs_at_another_size(denoiser: Denoiser) -> None:
+    class Positional(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = denoiser.deploy()
+
+        def forward(self, *tensors: Tensor) -> Tensor:
+            color: Tensor = self.inner(dict(zip(names, tensors, strict=True))).color
+            return color
+
+    small, large = inputs(denoiser, 1, 17, 31), inputs(denoiser, 2, 43, 29, seed=4)
+    names = tuple(small)
+    with torch.no_grad(), pytest.warns(DeprecationWarning, match="torch.jit.trace"):
+        traced = torch.jit.trace(Positional(), tuple(small.values()), check_trace=False)
+    with torch.no_grad():
+        assert largest_relative(traced(*large.values()), denoiser(large).color) < 1e-5

@@ -1,0 +1,108 @@
+"""Tiles with a halo give what the whole image gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from models import WSKP
+from models.tiling import denoise_tiled, tile_size, tiles
+from tests.models.frames import largest_relative, random_buffers
+
+
+class Pyramid:
+    """Not a module: only what tiling asks for. Averages 8x8 blocks, so that it needs aligned tiles."""
+
+    inputs = ("color",)
+    frame_numbers: tuple[str, ...] = ("exposure",)
+    halo = 5
+    multiple = 8
+
+    def __init__(self) -> None:
+        self.sizes: list[tuple[int, int]] = []
+        self.given: list[set[str]] = []
+
+    def measure(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {"exposure": 1 / buffers["color"].mean((1, 2, 3))}
+
+    def __call__(self, buffers: Mapping[str, Tensor]) -> Tensor:
+        color = buffers["color"]
+        self.sizes.append((color.shape[-2], color.shape[-1]))
+        self.given.append(set(buffers))
+        coarse = F.interpolate(F.avg_pool2d(color, 8), scale_factor=8)
+        near = F.avg_pool2d(F.pad(color, [5] * 4, mode="replicate"), 11, stride=1)
+        return (coarse + near) * buffers["exposure"][:, None, None, None]
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 64), (37, 61), (8, 100)])
+@pytest.mark.parametrize("tile", [1, 16, 20, 1000])
+def test_a_method_on_a_grid_of_8_gives_the_same_tiled(height: int, width: int, tile: int) -> None:
+    buffers = {"color": random_buffers(2, height, width)["irradiance"]}
+    padded = F.pad(buffers["color"], (0, -width % 8, 0, -height % 8), mode="replicate")
+    exposure = Pyramid().measure(buffers)
+    expected = Pyramid()({"color": padded, **exposure})[..., :height, :width]
+    found = denoise_tiled(Pyramid(), buffers, tile=tile)
+    assert found.shape == buffers["color"].shape
+    assert largest_relative(found, expected) < 1e-5
+
+
+def test_every_tile_has_aligned_sizes_and_the_frame_numbers() -> None:
+    method = Pyramid()
+    denoise_tiled(method, {"color": torch.rand(1, 3, 45, 70)}, tile=16)
+    assert all(h % 8 == 0 and w % 8 == 0 for h, w in method.sizes)
+    assert all(names == {"color", "exposure"} for names in method.given)
+
+
+def test_given_frame_numbers_are_not_measured_again() -> None:
+    color = torch.ones(1, 3, 16, 16)
+    found = denoise_tiled(Pyramid(), {"color": color, "exposure": torch.tensor([10.0])})
+    torch.testing.assert_close(found, color * 20)
+
+
+@pytest.mark.parametrize("tile", [16, 33])
+def test_wskp_tiled_equals_untiled(tile: int) -> None:
+    network = WSKP().eval()
+    buffers = {**random_buffers(2, 70, 83), "exposure": torch.tensor([1.0, 0.3])}
+    with torch.no_grad():
+        expected = network(buffers).color
+        assert largest_relative(denoise_tiled(network, buffers, tile=tile), expected) < 1e-5
+
+
+def test_cores_cover_every_pixel_once() -> None:
+    covered = torch.zeros(37, 61)
+    for piece in tiles(37, 61, (16, 20), 5):
+        covered[piece.core] += 1
+        for core, read in zip(piece.core, piece.read, strict=True):
+            assert read.start <= core.start
+            assert core.stop <= read.stop
+    assert (covered == 1).all()
+
+
+def test_tiles_fit_the_budget_and_use_it() -> None:
+    network = WSKP()
+    for budget in (20_000_000, 300_000_000):
+        side = tile_size(network, budget) + 2 * network.halo
+        assert side**2 * network.bytes_per_pixel <= budget
+        assert (side + 1) ** 2 * network.bytes_per_pixel > budget
+
+
+def test_a_budget_too_small_for_one_tile_says_how_much_is_needed() -> None:
+    with pytest.raises(ValueError, match=r"memory budget of 0\.1 MB is too small .* expected at least"):
+        denoise_tiled(WSKP(), random_buffers(1, 64, 64), budget=100_000)
+
+
+def test_a_missing_buffer_is_named() -> None:
+    buffers = random_buffers(1, 16, 16)
+    del buffers["albedo"]
+    with pytest.raises(ValueError, match="missing: albedo"):
+        denoise_tiled(WSKP(), buffers)
+
+
+def test_buffers_of_different_size_are_refused() -> None:
+    buffers = {**random_buffers(1, 16, 16), "depth": torch.ones(1, 1, 16, 17)}
+    with pytest.raises(ValueError, match="depth 17x16"):
+        denoise_tiled(WSKP(), buffers)
