@@ -33,6 +33,8 @@ class Packed(NamedTuple):
         numbers: (B, 3) float64: exposure and depth range.
         samples: Scene, frame and key of each.
         corrupt: Samples that were left out, with the reason.
+        error: Why there is no batch. Raised in a worker it would arrive as another type, with a traceback for
+            its message.
     """
 
     pixels: Tensor
@@ -40,6 +42,7 @@ class Packed(NamedTuple):
     numbers: Tensor
     samples: tuple[tuple[str, int, str], ...]
     corrupt: tuple[tuple[str, str], ...]
+    error: Exception | None = None
 
     def unpack(self) -> Batch:
         """Return the batch: views of `pixels`, frame numbers, scenes, frames, keys."""
@@ -90,10 +93,24 @@ class Batches(Dataset[Packed]):
         return len(self.reader)
 
     def __getitem__(self, order: Order) -> Packed:
+        try:
+            return self.read(order)
+        except (ValueError, OSError) as error:
+            if get_worker_info() is None:
+                raise
+            return _nothing(error=error)
+
+    def read(self, order: Order) -> Packed:
+        """Return the samples of an order; `[]` does the same, and in a worker packs errors.
+
+        Raises:
+            CorruptSampleError: A sample is damaged and is not to be skipped.
+            ValueError: A buffer is missing, or samples of different size would be in one batch.
+        """
         numbers, corrupt = self._readable(order.samples)
         samples = [self.reader.sample(number) for number in numbers]
         if not samples:
-            return Packed(torch.empty(0), (), torch.empty(0, 3), (), corrupt)
+            return _nothing(corrupt)
         shapes = tuple((name, (len(samples), buffer(name).channels, *_size(samples))) for name in self.names)
         pixels = _allocate(sum(int(np.prod(shape)) for _, shape in shapes))
         turns = [self._turn(order.epoch, number) for number in numbers]
@@ -173,6 +190,10 @@ def available(sample: Sample) -> tuple[str, ...]:
     if "color" in names and "albedo" in names:
         names["irradiance"] = None
     return tuple(names)
+
+
+def _nothing(corrupt: tuple[tuple[str, str], ...] = (), error: Exception | None = None) -> Packed:
+    return Packed(torch.empty(0), (), torch.empty(0, 3), (), corrupt, error)
 
 
 def _size(samples: list[Sample]) -> tuple[int, int]:

@@ -68,6 +68,8 @@ class _Loader:
                 generator=torch.Generator(),
             )
         for packed in self._inner:
+            if packed.error is not None:
+                raise packed.error
             for sample, reason in packed.corrupt:
                 if sample not in self.corrupt:
                     self.corrupt[sample] = reason

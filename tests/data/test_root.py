@@ -34,7 +34,7 @@ def test_ingested_and_prepared_folders_are_told_apart(tmp_path: Path):
 
 def test_a_missing_folder_names_the_commands(tmp_path: Path):
     with pytest.raises(
-        FileNotFoundError, match="does not exist.*trainer ingest.*trainer prepare.*sample:bmfr"
+        FileNotFoundError, match=r"does not exist.*trainer ingest.*trainer prepare.*sample:bmfr"
     ):
         resolve_root(tmp_path / "nothing")
 
@@ -83,6 +83,6 @@ def test_a_folder_above_a_data_set_names_it(tmp_path: Path):
 
 def test_any_other_folder_names_both_commands(tmp_path: Path):
     with pytest.raises(
-        ValueError, match="neither manifest.json .*trainer ingest.*nor index.json .*trainer prep"
+        ValueError, match=r"neither manifest.json .*trainer ingest.*nor index.json .*trainer prep"
     ):
         resolve_root(tmp_path)
