@@ -127,8 +127,8 @@ def write_record(
         raise ValueError(f"{frame.label} has no exposure")
     file = f"{frame.scene}/f{frame.index:03d}.exr"
     names = list(frame.buffers if only is None else only)
-    stored = replace(frame, buffers={n: frame.buffers[n] for n in names if n in frame.buffers}, notes={})
-    stored.require(*names)
+    frame.require(*names)
+    stored = replace(frame, buffers={n: frame.buffers[n] for n in names}, notes={})
     precision = write_frame(stored, output / file)
     known = derive(stored, derivable(stored), depth_kind=depth_kind)
     return FrameRecord(

@@ -157,19 +157,20 @@ def _shards(root: Path) -> dict[str, Any]:
         if not isinstance(index, dict) or index["format"] != "penumbra-shards":
             raise ValueError("its `format` is not penumbra-shards")
         shards = index["shards"]
+        found = {s["file"]: _shard_problem(root, s) for s in shards}
         splits = {split: [s for s in shards if s["split"] == split] for split in SPLITS}
         return {
             "kind": "shards",
             "path": str(root),
             "manifest_hash": index["manifest_hash"],
             "options": index["options"],
-            "problems": [p for s in shards if (p := _shard_problem(root, s))],
+            "problems": [p for p in found.values() if p],
             "splits": {
                 name: {
                     "shards": len(group),
                     "samples": sum(len(s["samples"]) for s in group),
                     "bytes": sum(s["bytes"] for s in group),
-                    "buffers": _sampled(root, group),
+                    "buffers": _sampled(root, [s for s in group if not found[s["file"]]]),
                 }
                 for name, group in splits.items()
             },
@@ -188,8 +189,8 @@ def _shard_problem(root: Path, shard: Mapping[str, Any]) -> str | None:
 
 
 def _sampled(root: Path, shards: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return statistics over a few samples, evenly spread over the shards of a split."""
-    places = [(s["file"], p) for s in shards if (root / s["file"]).is_file() for p in s["samples"]]
+    """Return statistics over a few samples, evenly spread over whole shards of a split."""
+    places = [(s["file"], p) for s in shards for p in s["samples"]]
     chosen = places[:: max(1, -(-len(places) // SAMPLES))]
     found: dict[str, list[dict[str, Any]]] = {}
     for file, place in chosen:

@@ -110,8 +110,13 @@ def read(inputs: Path, header: Path, scene: str, index: int) -> Frame:
     )
 
 
-@lru_cache(maxsize=32)
 def _cameras(header: Path) -> BmfrCameras:
+    status = header.stat()
+    return _parsed(header, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=32)
+def _parsed(header: Path, changed: int, size: int) -> BmfrCameras:
     return read_cameras(header)
 
 

@@ -1,0 +1,169 @@
+import argparse
+import hashlib
+import io
+import json
+import tarfile
+
+import numpy as np
+import pytest
+
+from data.exr import write_exr, write_frame
+from tests.data.miniature import bmfr_scene, ingested, penumbra_scene, sample_crop
+from trainer.commands import inspect as command
+
+
+def call(*arguments):
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args([str(a) for a in arguments]))
+
+
+def found(path, capsys, code=0):
+    assert call(path, "--json") == code
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_file_is_described_buffer_by_buffer(tmp_path, capsys):
+    frame = sample_crop("classroom", 2)
+    write_frame(frame, tmp_path / "x.exr", ["color", "depth", "normal"])
+    report = found(tmp_path / "x.exr", capsys)
+    assert (report["kind"], report["scene"], report["frame"], report["spp"]) == ("file", "classroom", 2, 1)
+    assert report["camera"]["world_to_pixel"] == frame.camera.world_to_pixel.tolist()
+    color = report["buffers"]["color"]
+    assert color["channels"] == ["color.R", "color.G", "color.B"]
+    assert color["type"] == "half"
+    assert color["max"] == pytest.approx(float(frame.buffers["color"].max()))
+    assert color["median"] == pytest.approx(float(np.median(frame.buffers["color"])))
+    black = 100 * (frame.buffers["color"] == 0).all(-1).mean()
+    assert color["no_hit_percent"] == pytest.approx(black)
+    assert report["buffers"]["depth"]["type"] == "float"
+
+
+def test_broken_pixels_and_unknown_channels_are_reported(tmp_path, capsys):
+    image = np.ones((10, 10), np.float32)
+    image[0, :3] = np.nan
+    channels = {f"color.{c}": image for c in "RGB"} | {"crypto.R": image}
+    write_exr(tmp_path / "x.exr", channels)
+    report = found(tmp_path / "x.exr", capsys)
+    assert report["buffers"]["color"]["non_finite_percent"] == 3
+    assert report["ignored"] == ["crypto.R"]
+
+
+def test_the_table_of_a_file_names_channels_and_numbers(tmp_path, capsys):
+    write_frame(sample_crop("classroom", 2), tmp_path / "x.exr", ["color"])
+    assert call(tmp_path / "x.exr") == 0
+    text = capsys.readouterr().out
+    assert "scene classroom, frame 2, spp 1, exposure 2.275, camera yes" in text
+    assert "NaN/Inf %" in text
+    assert "half" in text
+
+
+def test_the_sample_is_described_with_splits_credits_and_checksums(capsys):
+    assert call("sample:bmfr") == 0
+    text = capsys.readouterr().out
+    assert "train: classroom, cbox-glossy; validation: none; test: living-room-2" in text
+    assert "checksums: all files match" in text
+    assert "NovaZeeke" in text
+    assert "derived: irradiance = color / albedo" in text
+
+
+def test_an_unknown_sample_is_named():
+    with pytest.raises(ValueError, match="there is no sample 'kpcn'; there is bmfr"):
+        call("sample:kpcn")
+
+
+def test_a_data_set_with_an_altered_file_is_reported_and_fails(tmp_path, capsys):
+    root = ingested(tmp_path)
+    report = found(root, capsys)
+    assert report["problems"] == []
+    assert report["scenes"]["classroom"]["frames"] == 2
+    assert report["first_frames"]["classroom"]["buffers"]["irradiance"]["type"] == "derived"
+    (root / "classroom" / "f001.exr").write_bytes(b"x")
+    report = found(root, capsys, code=1)
+    assert "f001.exr has 1 bytes" in report["problems"][0]
+    assert call(root) == 1
+    assert "problem: " in capsys.readouterr().out
+
+
+def test_the_manifest_itself_can_be_named(tmp_path, capsys):
+    assert found(ingested(tmp_path) / "manifest.json", capsys)["kind"] == "data set"
+
+
+def test_a_raw_layout_is_recognised(tmp_path, capsys):
+    bmfr_scene(tmp_path / "b", "classroom")
+    penumbra_scene(tmp_path / "p", "classroom")
+    report = found(tmp_path / "b", capsys)
+    assert (report["kind"], report["layout"], report["frames"], report["depth"]) == ("layout", "bmfr", 2, "z")
+    assert report["scenes"]["classroom"]["thresholds"]["position_limit_squared"] == 0.01
+    assert found(tmp_path / "p", capsys)["layout"] == "penumbra"
+    assert call(tmp_path / "b") == 0
+    assert "position_limit_squared 0.01" in capsys.readouterr().out
+
+
+def shards(root, broken=False):
+    """Write two samples of 4x4 in the form of prepared shards."""
+    root.mkdir()
+    color = np.arange(48, dtype="<f2").reshape(3, 4, 4)
+    depth = np.full((1, 4, 4), 2, "<f4")
+    buffers = [
+        {"name": "color", "dtype": "<f2", "shape": [3, 4, 4], "offset": 0},
+        {"name": "depth", "dtype": "<f4", "shape": [1, 4, 4], "offset": 96},
+    ]
+    data, samples = b"", []
+    for number in range(2):
+        stream = io.BytesIO()
+        with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+            texts = {
+                ".json": json.dumps({"buffers": buffers}).encode(),
+                ".buffers": color.tobytes() + depth.tobytes(),
+            }
+            for suffix, content in texts.items():
+                info = tarfile.TarInfo(f"k{number}{suffix}")
+                info.size = len(content)
+                tar.addfile(info, io.BytesIO(content))
+        size = 2 * 512 + 512 * (-(-len(texts[".json"]) // 512) + 1)
+        samples.append({"key": f"k{number}", "offset": len(data), "size": size, "crc32": 0})
+        data += stream.getvalue()[:size]
+    (root / "train-00000.tar").write_bytes(data[:-7] if broken else data)
+    shard = {"file": "train-00000.tar", "split": "train", "bytes": len(data), "samples": samples}
+    shard["sha256"] = hashlib.sha256(data).hexdigest()
+    index = {"format": "penumbra-shards", "version": 1, "manifest_hash": "ab" * 32, "manifest": {}}
+    (root / "index.json").write_text(json.dumps(index | {"options": {"patch": 4}, "shards": [shard]}))
+    return root
+
+
+def test_shards_are_described_from_their_index_and_a_few_samples(tmp_path, capsys):
+    report = found(shards(tmp_path / "s"), capsys)
+    train = report["splits"]["train"]
+    assert (report["kind"], train["samples"], train["shards"]) == ("shards", 2, 1)
+    assert train["buffers"]["color"]["max"] == 47
+    assert train["buffers"]["color"]["type"] == "half"
+    assert train["buffers"]["depth"]["median"] == 2
+    assert report["splits"]["test"]["samples"] == 0
+    assert call(tmp_path / "s") == 0
+    assert "train: 2 samples in 1 shards" in capsys.readouterr().out
+
+
+def test_a_truncated_shard_is_reported_and_fails(tmp_path, capsys):
+    report = found(shards(tmp_path / "s", broken=True), capsys, code=1)
+    assert "does not match its checksum" in report["problems"][0]
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"format": "other"}', '{"format": "penumbra-shards"}'])
+def test_a_damaged_index_is_refused(tmp_path, text):
+    (tmp_path / "index.json").write_text(text)
+    with pytest.raises(ValueError, match=r"index\.json is damaged: .*run `trainer prepare` again"):
+        call(tmp_path)
+
+
+def test_paths_that_hold_nothing_known_are_refused_with_what_was_expected(tmp_path):
+    with pytest.raises(FileNotFoundError, match="none does not exist"):
+        call(tmp_path / "none")
+    with pytest.raises(ValueError, match="is neither an EXR file, an ingested data set"):
+        call(tmp_path)
+    (tmp_path / "x.exr").write_bytes(b"text")
+    with pytest.raises(ValueError, match="not an OpenEXR file"):
+        call(tmp_path / "x.exr")
+    (tmp_path / "set" / ".partial").mkdir(parents=True)
+    with pytest.raises(ValueError, match="is an unfinished ingestion; run the same `trainer ingest` command"):
+        call(tmp_path / "set")
