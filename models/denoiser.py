@@ -51,7 +51,7 @@ class Denoiser(nn.Module):
     multiple: int = 1
     temporal: bool = False
     per_sample: bool = False
-    bytes_per_pixel: int = 1500
+    bytes_per_pixel: int = 500
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise a batch of images.

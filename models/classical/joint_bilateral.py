@@ -39,6 +39,7 @@ class JointBilateral(Denoiser):
     """
 
     inputs = ("irradiance", "albedo", "normal", "depth")
+    bytes_per_pixel = 250  # resident memory grows by 165 at 1280x720
 
     def __init__(
         self,
