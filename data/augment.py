@@ -94,13 +94,14 @@ def turned(image: Array, turn: Turn) -> Array:
     Raises:
         ValueError: A quarter turn of an image that is not square, which would change its shape.
     """
-    if turn & Turn.TRANSPOSE:
+    bits = int(turn)  # operations of enumerations cost more than these views
+    if bits & 4:
         if image.shape[-1] != image.shape[-2]:
             raise ValueError(f"a quarter turn needs a square patch, got {image.shape[-1]}x{image.shape[-2]}")
         image = image.swapaxes(-1, -2)
-    if turn & Turn.FLIP_Y:
+    if bits & 2:
         image = image[..., ::-1, :]
-    if turn & Turn.FLIP_X:
+    if bits & 1:
         image = image[..., ::-1]
     return image
 

@@ -8,14 +8,17 @@ import os
 import tarfile
 import warnings
 import zlib
+from bisect import bisect_right
 from collections import OrderedDict
+from itertools import accumulate
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from data.shards.index import Index
+
+DTYPES = {"<f2": torch.float16, "<f4": torch.float32}
 
 OPEN_FILES = 256
 """Shards mapped at one time by one process; a limit of 1024 open files is common."""
@@ -36,13 +39,17 @@ class CorruptSampleError(ValueError):
         return type(self), (self.sample, str(self))
 
 
+Mapped = tuple[mmap.mmap, dict[torch.dtype, Tensor]]
+"""A file in memory, and all of it as a tensor of each type."""
+
+
 class Stored(NamedTuple):
-    """Where an array of a sample lies in its shard: type, shape (C, H, W), first byte and size."""
+    """Where an array of a sample lies in its shard: type, shape (C, H, W), first value counted in that
+    type."""
 
     dtype: torch.dtype
     shape: tuple[int, int, int]
     start: int
-    size: int
 
 
 class Sample(NamedTuple):
@@ -56,6 +63,7 @@ class Sample(NamedTuple):
     accumulated: bool
     height: int
     width: int
+    shard: int
     buffers: dict[str, Stored]
 
 
@@ -75,11 +83,11 @@ class ShardReader:
         self.shards = index.of(split)
         sizes = [len(shard.samples) for shard in self.shards]
         self.shard_sizes = sizes
-        self._first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self._first = [0, *accumulate(sizes)]
         self._forget()
 
     def __len__(self) -> int:
-        return int(self._first[-1])
+        return self._first[-1]
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
@@ -93,15 +101,15 @@ class ShardReader:
 
     def _forget(self) -> None:
         self._pid = os.getpid()
-        self._maps: OrderedDict[int, tuple[mmap.mmap, Tensor]] = OrderedDict()
+        self._maps: OrderedDict[int, Mapped] = OrderedDict()
         self._samples: dict[int, Sample] = {}
 
     def locate(self, number: int) -> tuple[int, int]:
         """Return the shard of a sample and its place in it."""
         if not 0 <= number < len(self):
             raise IndexError(f"sample {number} of {len(self)} in split {self.split!r}")
-        shard = int(np.searchsorted(self._first, number, side="right")) - 1
-        return shard, number - int(self._first[shard])
+        shard = bisect_right(self._first, number) - 1
+        return shard, number - self._first[shard]
 
     def name(self, number: int) -> str:
         """Return shard and key of a sample, for messages."""
@@ -130,15 +138,17 @@ class ShardReader:
             ValueError: The sample has no such buffer; the message lists what it has.
             CorruptSampleError: As `sample`.
         """
-        stored = self.sample(number).buffers.get(name)
+        sample = self.sample(number)
+        stored = sample.buffers.get(name)
         if stored is None:
             raise ValueError(
                 f"{self.name(number)} has no buffer {name!r}; it holds "
-                f"{', '.join(self.sample(number).buffers)}. Prepare again from frames that have it: "
+                f"{', '.join(sample.buffers)}. Prepare again from frames that have it: "
                 f"trainer prepare FRAMES --output SHARDS --buffers {name},…"
             )
-        _, data = self._map(number, self.locate(number)[0])
-        return data[stored.start : stored.start + stored.size].view(stored.dtype).view(stored.shape)
+        _, views = self._map(number, sample.shard)
+        _, height, width = stored.shape
+        return views[stored.dtype].as_strided(stored.shape, (height * width, width, 1), stored.start)
 
     def _read(self, number: int, shard: int, place: int) -> Sample:
         record = self.shards[shard].samples[place]
@@ -149,11 +159,11 @@ class ShardReader:
         if self.verify and zlib.crc32(raw) != record.crc32:
             raise self._corrupt(number, "its checksum differs from the index")
         try:
-            return _parse(record.key, raw, record.offset)
+            return _parse(record.key, raw, record.offset, shard)
         except (ValueError, KeyError, TypeError) as error:
             raise self._corrupt(number, f"it cannot be read ({error})") from error
 
-    def _map(self, number: int, shard: int) -> tuple[mmap.mmap, Tensor]:
+    def _map(self, number: int, shard: int) -> Mapped:
         found = self._maps.get(shard)
         if found is None:
             record = self.shards[shard]
@@ -166,8 +176,9 @@ class ShardReader:
                 raise self._corrupt(number, "the file is empty") from error
             with warnings.catch_warnings():  # torch warns of read-only memory; nothing here writes to it
                 warnings.simplefilter("ignore", UserWarning)
-                data = torch.frombuffer(mapped, dtype=torch.uint8)
-            found = self._maps[shard] = (mapped, data)
+                data = torch.frombuffer(mapped, dtype=torch.uint8, count=len(mapped) // 4 * 4)
+            views = {dtype: data.view(dtype) for dtype in DTYPES.values()}
+            found = self._maps[shard] = (mapped, views)
             if len(self._maps) > OPEN_FILES:
                 self._maps.popitem(last=False)
         return found
@@ -181,7 +192,7 @@ class ShardReader:
         )
 
 
-def _parse(key: str, raw: memoryview, offset: int) -> Sample:
+def _parse(key: str, raw: memoryview, offset: int, shard: int) -> Sample:
     """Read the two tar headers and the JSON of a sample; `offset` is where `raw` begins in the file."""
     block = tarfile.BLOCKSIZE
     length = int(bytes(raw[124:135]), 8)
@@ -190,12 +201,9 @@ def _parse(key: str, raw: memoryview, offset: int) -> Sample:
     buffers = {}
     for entry in meta["buffers"]:
         channels, height, width = entry["shape"]
-        buffers[entry["name"]] = Stored(
-            {"<f2": torch.float16, "<f4": torch.float32}[entry["dtype"]],
-            (channels, height, width),
-            start + entry["offset"],
-            entry["bytes"],
-        )
+        dtype = DTYPES[entry["dtype"]]
+        first = (start + entry["offset"]) // dtype.itemsize
+        buffers[entry["name"]] = Stored(dtype, (channels, height, width), first)
     low, high = meta["depth_range"]
     return Sample(
         key,
@@ -206,5 +214,6 @@ def _parse(key: str, raw: memoryview, offset: int) -> Sample:
         meta["accumulated"],
         meta["height"],
         meta["width"],
+        shard,
         buffers,
     )
