@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import models
 from models import WSKP
 from models.denoiser import Buffers, Denoised, Denoiser
 from trainer.commands import export as command
@@ -161,6 +162,12 @@ def test_a_denoiser_without_frame_numbers_or_parameters_is_exported(tmp_path: Pa
     export(Blur(), path, format)  # type: ignore[arg-type]
     color = torch.rand(2, 3, 21, 34)
     assert torch.allclose(load_artifact(path)({"color": color}).color, Blur()({"color": color}).color)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, format: str) -> None:
+    net = models.JointBilateral(radius=2)
+    assert export(net, tmp_path / "net.bin", format).error <= LIMIT  # type: ignore[arg-type]
 
 
 def test_export_leaves_the_denoiser_as_it_was(tmp_path: Path) -> None:

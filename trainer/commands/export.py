@@ -60,14 +60,20 @@ def run(args: argparse.Namespace) -> int:
     names = targets(args.output, formats, type(loaded.model).__name__.lower())
     refuse_existing(names.values(), args.force)
     table = Table(title=f"{type(loaded.model).__name__} from {args.model}", title_justify="left")
-    for title in ("file", "format", "differs from eager", "checked on (batch x width x height)", "runtime"):
+    for title in ("file", "format", "differs from eager", "checked with"):
         table.add_column(title, overflow="fold")
     for format, path in names.items():
         print(f"exporting {path} …", file=sys.stderr)
         parity = export(loaded.model, path, format, source=loaded.source, force=args.force)  # type: ignore[arg-type]
-        sizes = ", ".join(f"{b}x{w}x{h}" for b, h, w in parity.sizes)
-        table.add_row(str(path), format, f"{parity.error:.1e} relative", sizes, parity.runtime)
-    Console().print(table)
+        table.add_row(str(path), format, f"{parity.error:.1e}", parity.runtime)
+    console = Console()
+    console.print(table)
+    sizes = ", ".join(f"{batch} x {width}x{height}" for batch, height, width in parity.sizes)
+    console.print(
+        f"Largest relative difference over {sizes} (images x size), with fireflies, with and without frame "
+        f"numbers; allowed {parity.limit:g}.",
+        highlight=False,
+    )
     return 0
 
 
