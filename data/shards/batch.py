@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ class Packed(NamedTuple):
     Attributes:
         pixels: float32, one after another each buffer's (B, C, H, W).
         shapes: Name and shape of each.
-        numbers: (B, 3) float64: exposure and depth range.
+        numbers: Exposure, smallest and largest depth of each.
         samples: Scene, frame and key of each.
         corrupt: Samples that were left out, with the reason.
         error: Why there is no batch. Raised in a worker it would arrive as another type, with a traceback for
@@ -39,7 +40,7 @@ class Packed(NamedTuple):
 
     pixels: Tensor
     shapes: tuple[tuple[str, tuple[int, int, int, int]], ...]
-    numbers: Tensor
+    numbers: tuple[tuple[float, float, float], ...]
     samples: tuple[tuple[str, int, str], ...]
     corrupt: tuple[tuple[str, str], ...]
     error: Exception | None = None
@@ -49,10 +50,10 @@ class Packed(NamedTuple):
         batch: Batch = {}
         start = 0
         for name, shape in self.shapes:
-            size = int(np.prod(shape))
+            size = math.prod(shape)
             batch[name] = self.pixels[start : start + size].view(shape)
             start += size
-        numbers = self.numbers.to(torch.float32)
+        numbers = torch.tensor(self.numbers, dtype=torch.float32)
         batch["exposure"] = numbers[:, 0].contiguous()
         batch["depth_range"] = numbers[:, 1:].contiguous()
         batch["scene"] = [scene for scene, _, _ in self.samples]
@@ -112,11 +113,11 @@ class Batches(Dataset[Packed]):
         if not samples:
             return _nothing(corrupt)
         shapes = tuple((name, (len(samples), buffer(name).channels, *_size(samples))) for name in self.names)
-        pixels = _allocate(sum(int(np.prod(shape)) for _, shape in shapes))
+        pixels = _allocate(sum(math.prod(shape) for _, shape in shapes))
         turns = [self._turn(order.epoch, number) for number in numbers]
         start = 0
         for name, shape in shapes:
-            size = int(np.prod(shape))
+            size = math.prod(shape)
             target = pixels[start : start + size].view(shape)
             for row, number in enumerate(numbers):
                 self._fill(target[row], number, name, turns[row])
@@ -124,7 +125,7 @@ class Batches(Dataset[Packed]):
         return Packed(
             pixels,
             shapes,
-            torch.tensor([self._numbers(order.epoch, n, s) for n, s in zip(numbers, samples, strict=True)]),
+            tuple(self._numbers(order.epoch, n, s) for n, s in zip(numbers, samples, strict=True)),
             tuple((sample.scene, sample.frame, sample.key) for sample in samples),
             corrupt,
         )
@@ -193,7 +194,7 @@ def available(sample: Sample) -> tuple[str, ...]:
 
 
 def _nothing(corrupt: tuple[tuple[str, str], ...] = (), error: Exception | None = None) -> Packed:
-    return Packed(torch.empty(0), (), torch.empty(0, 3), (), corrupt, error)
+    return Packed(torch.empty(0), (), (), (), corrupt, error)
 
 
 def _size(samples: list[Sample]) -> tuple[int, int]:
