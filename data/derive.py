@@ -200,7 +200,9 @@ class _Context:
 
 def no_hit(frame: Frame) -> NDArray[np.bool_]:
     """Return where nothing was hit (H, W, 1): position exactly 0, and so is the normal where there is one."""
-    nothing = (frame.buffers["position"] == 0).all(-1, keepdims=True)
-    if "normal" in frame.buffers:
-        nothing &= (frame.buffers["normal"] == 0).all(-1, keepdims=True)
-    return np.asarray(nothing)
+    nothing = np.ones((frame.height, frame.width), bool)
+    for name in ("position", "normal"):
+        if name in frame.buffers:
+            for channel in np.moveaxis(frame.buffers[name], -1, 0):
+                nothing &= channel == 0
+    return nothing[..., None]
