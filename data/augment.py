@@ -8,13 +8,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Literal
+from itertools import permutations
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data.buffers import buffer
+
 Rule = Literal["wskp", "dihedral", "none"]
 Array = NDArray[np.float32]
+
+WORLD_VECTORS = frozenset({"normal", "normal_a", "normal_b", "position", "position_a", "position_b"})
+"""Vectors in world space, which turn with the axes of the world."""
+
+ORDERS = tuple(permutations(range(3)))
+"""The six orders of three channels; the first leaves them."""
 
 IMAGE_PLANE = frozenset({"motion", "motion_a", "motion_b"})
 """Vectors (x to the right, y down) that turn with the image. Normals are in world space and stay."""
@@ -49,6 +58,27 @@ def random_bits(*words: int) -> int:
     return state
 
 
+class Change(NamedTuple):
+    """What happens to one sample in one epoch.
+
+    Attributes:
+        turn: Symmetry of the square.
+        colors: Order of the channels of radiance and reflectance.
+        axes: Order of the coordinates of world-space vectors.
+        signs: Sign of each of them afterwards.
+        alone: `irradiance` is that of the frame alone, without history.
+    """
+
+    turn: Turn = Turn.NONE
+    colors: tuple[int, ...] = ORDERS[0]
+    axes: tuple[int, ...] = ORDERS[0]
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    alone: bool = False
+
+
+UNCHANGED = Change()
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """What may happen to a training sample.
@@ -59,17 +89,36 @@ class Augmentation:
             a square, all equally likely. `none`: nothing.
         exposure_stops: Exposure is multiplied by 2^u, u uniform in [-stops, stops].
         seed: Seed of the run.
+        permute: Radiance and reflectance change the order of their channels together, as in OIDN's training;
+            world-space vectors change the order and the signs of their coordinates, since no axis of the
+            world means anything to a denoiser.
+        drop_history: Probability with which accumulated `irradiance` is replaced by that of the frame alone,
+            as at the start of a sequence and where a surface comes into view.
     """
 
     rule: Rule = "wskp"
     exposure_stops: float = 0.0
     seed: int = 0
+    permute: bool = False
+    drop_history: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rule not in ("wskp", "dihedral", "none"):
             raise ValueError(f"augmentation rule {self.rule!r}; expected wskp, dihedral or none")
         if not 0 <= self.exposure_stops <= 16:
             raise ValueError(f"exposure_stops is {self.exposure_stops}; expected 0 to 16")
+        if not 0 <= self.drop_history <= 1:
+            raise ValueError(f"drop_history is {self.drop_history}; expected a probability, 0 to 1")
+
+    def change(self, epoch: int, sample: int) -> Change:
+        """Return what is applied to the images of a sample in an epoch."""
+        colors, axes, signs = ORDERS[0], ORDERS[0], (1.0, 1.0, 1.0)
+        if self.permute:
+            bits = random_bits(self.seed, epoch, sample, 3) >> 8
+            colors, axes, octant = ORDERS[bits % 6], ORDERS[bits // 6 % 6], bits // 36
+            signs = (1.0 - 2 * (octant & 1), 1.0 - (octant & 2), 1.0 - (octant & 4) / 2)
+        alone = random_bits(self.seed, epoch, sample, 4) < self.drop_history * 2**64
+        return Change(self.turn(epoch, sample), colors, axes, signs, alone)
 
     def turn(self, epoch: int, sample: int) -> Turn:
         """Return the symmetry that is applied to a sample in an epoch."""
@@ -103,6 +152,15 @@ def turned(image: Array, turn: Turn) -> Array:
         image = image[..., ::-1, :]
     if bits & 1:
         image = image[..., ::-1]
+    return image
+
+
+def reordered(image: Array, name: str, change: Change) -> Array:
+    """Return an image (C, H, W) whose channels are in the changed order; the same array if none changes."""
+    if name in WORLD_VECTORS and (change.axes != ORDERS[0] or min(change.signs) < 0):
+        return image[list(change.axes)] * np.asarray(change.signs, np.float32)[:, None, None]
+    if change.colors != ORDERS[0] and buffer(name).letters == "RGB":
+        return image[list(change.colors)]
     return image
 
 

@@ -38,10 +38,12 @@ class Shards(LightningDataModule):
         batch_size: Samples per batch and rank; test has batches of one frame.
         workers: Processes that read, per rank; 0 reads in the training process.
         seed: Seed of order and augmentation, and of patch positions where the root is prepared here.
-        augment: Flip and rotate training patches.
+        augment: Change training patches as the options below say; off, they stay as they are.
         augment_rule: `wskp`: with probability 0.5 one of two flips and two quarter turns; `dihedral`: one of
             the eight symmetries of a square.
         exposure_stops: Vary the exposure of training patches by up to so many stops up and down.
+        permute: Permute colour channels and world axes of training patches.
+        drop_history: Share of training patches whose input is not accumulated.
         train_patches: Training patches per 1280x720 frame, where the root is prepared here.
         validation_patches: Validation patches per 1280x720 frame, where the root is prepared here.
         patch_size: Width and height of patches, where the root is prepared here.
@@ -64,6 +66,8 @@ class Shards(LightningDataModule):
         augment: bool = True,
         augment_rule: Rule = "wskp",
         exposure_stops: float = 0.0,
+        permute: bool = False,
+        drop_history: float = 0.0,
         train_patches: int = 80,
         validation_patches: int = 20,
         patch_size: int = 128,
@@ -79,7 +83,11 @@ class Shards(LightningDataModule):
             raise ValueError(f"on_corrupt is {on_corrupt!r}; expected 'raise' or 'skip'")
         self.root = root
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
-        self.augmentation = Augmentation(augment_rule if augment else "none", exposure_stops, seed)
+        self.augmentation = (
+            Augmentation(augment_rule, exposure_stops, seed, permute, drop_history)
+            if augment
+            else Augmentation("none", seed=seed)
+        )
         self.options = PrepareOptions(
             patch_size=patch_size,
             train_patches=train_patches,

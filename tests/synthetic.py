@@ -43,7 +43,11 @@ class Synthetic(LightningDataModule):
     manifest_hash = "synthetic"
 
     def __init__(
-        self, batch_size: int = 4, count: int = 16, buffers: tuple[str, ...] | None = None, temporal: bool = True
+        self,
+        batch_size: int = 4,
+        count: int = 16,
+        buffers: tuple[str, ...] | None = None,
+        temporal: bool = True,
     ) -> None:
         super().__init__()
         self.batch_size = batch_size

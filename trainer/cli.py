@@ -90,9 +90,10 @@ def _check_packages() -> None:
     for name in ("data", "models"):
         spec = importlib.util.find_spec(name)
         place = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-        found = os.path.dirname(os.path.dirname(os.path.abspath(spec.origin))) if spec and spec.origin else None
+        origin = spec.origin if spec else None
+        found = os.path.dirname(os.path.dirname(os.path.abspath(origin))) if origin else None
         if found != place:
             raise ValueError(
-                f"the package {name!r} is taken from {found or 'a folder without __init__.py'}, not from Penumbra "
-                f"({place}); start the command from another directory or use an environment of its own"
+                f"the package {name!r} is taken from {found or 'a folder of that name'}, not from "
+                f"Penumbra ({place}); start the command from another directory or use an environment of its own"
             )

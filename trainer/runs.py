@@ -102,8 +102,8 @@ def find_checkpoint(word: str, root: Path, experiment: str) -> Path:
             if path.is_file():
                 return path
         raise ValueError(
-            f"--ckpt_path {word}: no run of {experiment!r} below {root / experiment} has a {word} checkpoint; "
-            "give the path of a checkpoint, or leave the option out to start anew"
+            f"--ckpt_path {word}: no run of {experiment!r} below {root / experiment} has a {word} "
+            "checkpoint; give the path of a checkpoint, or leave the option out to start anew"
         )
     path = Path(word)
     if path.is_dir():

@@ -12,7 +12,8 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -207,15 +208,14 @@ class MLflowTracking(Logger):
             self._params = set(self.call(lambda c, run: c.get_run(run)).data.params)
         new = [Param(key, str(value)[:500]) for key, value in params.items() if key not in self._params]
         for start in range(0, len(new), 100):
-            chunk = new[start : start + 100]
-            self.call(lambda client, run, chunk=chunk: client.log_batch(run, params=chunk))
+            self.call(partial(_log_params, new[start : start + 100]))
         self._params.update(params)
 
     @rank_zero_only
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Set tags of the run."""
         for key, value in tags.items():
-            self.call(lambda client, run, k=key, v=value: client.set_tag(run, k, v))
+            self.call(partial(_set_tag, key, value))
 
     @rank_zero_only
     def log_file(self, path: Path, folder: str | None = None) -> None:
@@ -263,7 +263,7 @@ class MLflowTracking(Logger):
 
         assert self._record is not None
         try:
-            client.set_terminated(self._record.run_id, "RUNNING")
+            client.set_terminated(self._record.run_id or "", "RUNNING")
         except MlflowException:
             print(
                 f"The run {self._record.name} is no longer in its store; a new one takes its place.",
@@ -272,7 +272,7 @@ class MLflowTracking(Logger):
             return False
         return True
 
-    def _create(self, uri: str, **facts: str | None) -> None:
+    def _create(self, uri: str, unreached_uri: str | None = None, server_run_id: str | None = None) -> None:
         client = self._client
         assert client is not None
         run: Run = client.create_run(
@@ -280,7 +280,9 @@ class MLflowTracking(Logger):
             run_name=self.folder.name,
             tags={"penumbra.folder": str(self.folder)},
         )
-        record = RunRecord(self.experiment_name, self.folder.name, uri, run.info.run_id, **facts)
+        record = RunRecord(
+            self.experiment_name, self.folder.name, uri, run.info.run_id, unreached_uri, server_run_id
+        )
         record.save(self.folder)
         self._record = record
         self._start_monitor(resumed=False)
@@ -308,3 +310,11 @@ class MLflowTracking(Logger):
             self.run_id, sampling_interval=10, resume_logging=resumed, tracking_uri=self.uri
         )
         self._monitor.start()
+
+
+def _log_params(params: Sequence[Any], client: MlflowClient, run: str) -> None:
+    client.log_batch(run, params=params)
+
+
+def _set_tag(key: str, value: str, client: MlflowClient, run: str) -> None:
+    client.set_tag(run, key, value)

@@ -41,7 +41,6 @@ def quiet_libraries() -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     for message, category in (
         (r".*LeafSpec.*", FutureWarning),  # lightning 2.6 on torch 2.13
-        (r"Attribute '.*' is an instance of `nn.Module`", UserWarning),  # the checkpoint holds its class path
         (r".*does not have many workers.*", UserWarning),  # the loader's own choice
         (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
         (r".*is smaller than the logging interval.*", UserWarning),
@@ -63,7 +62,7 @@ class Parser(LightningArgumentParser):
 
     def known_names(self) -> set[str]:
         """Return every option name and every argument of the classes that can be configured."""
-        names = {key for key in self.get_defaults(skip_validation=True).keys()}
+        names: set[str] = set(self.get_defaults(skip_validation=True).keys())
         names |= {part for key in names for part in key.split(".")}
         return names | class_arguments()
 
@@ -87,7 +86,9 @@ def explain(message: str, known: Iterable[str]) -> str:
     """Return jsonargparse's message in short, with the nearest known name where one was misspelt."""
     lines = [line.strip(" -\n") for line in message.splitlines() if line.strip()]
     text = " ".join(dict.fromkeys(lines))
-    wrong = re.search(r"(?:Unrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text)
+    wrong = re.search(
+        r"(?:Unrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text
+    )
     if wrong is None:
         return text
     word = wrong.group(1)
@@ -115,9 +116,8 @@ class TrainingCLI(LightningCLI):
 
     def __init__(self, args: ArgsType = None) -> None:
         defaults = [str(configs.folder() / configs.DEFAULTS)]
-        kwargs: dict[str, Any] = {
-            verb: {"default_config_files": defaults, "allow_abbrev": False} for verb in self.subcommands()
-        }
+        kwargs: dict[str, Any] = {verb: {"default_config_files": defaults} for verb in self.subcommands()}
+        kwargs["allow_abbrev"] = False  # the parsers of the verbs inherit it
         super().__init__(
             LightningModule,
             LightningDataModule,

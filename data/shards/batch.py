@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
-from data.augment import IMAGE_PLANE, Augmentation, Turn, turn_vectors, turned
+from data.augment import IMAGE_PLANE, UNCHANGED, Augmentation, Change, Turn, reordered, turn_vectors, turned
 from data.buffers import buffer
 from data.shards.read import CorruptSampleError, Sample, ShardReader
 
@@ -114,13 +114,13 @@ class Batches(Dataset[Packed]):
             return _nothing(corrupt)
         shapes = tuple((name, (len(samples), buffer(name).channels, *_size(samples))) for name in self.names)
         pixels = _allocate(sum(math.prod(shape) for _, shape in shapes))
-        turns = [self._turn(order.epoch, number) for number in numbers]
+        changes = [self._change(order.epoch, number) for number in numbers]
         start = 0
         for name, shape in shapes:
             size = math.prod(shape)
             target = pixels[start : start + size].view(shape)
             for row, number in enumerate(numbers):
-                self._fill(target[row], number, name, turns[row])
+                self._fill(target[row], number, name, changes[row])
             start += size
         return Packed(
             pixels,
@@ -153,28 +153,38 @@ class Batches(Dataset[Packed]):
         total = len(self.reader)
         return ((number + step) % total for step in range(total))
 
-    def _turn(self, epoch: int, number: int) -> Turn:
-        return Turn.NONE if self.augmentation is None else self.augmentation.turn(epoch, number)
+    def _change(self, epoch: int, number: int) -> Change:
+        return UNCHANGED if self.augmentation is None else self.augmentation.change(epoch, number)
 
     def _numbers(self, epoch: int, number: int, sample: Sample) -> tuple[float, float, float]:
         factor = 1.0 if self.augmentation is None else self.augmentation.exposure_factor(epoch, number)
         return (sample.exposure * factor, *sample.depth_range)
 
-    def _fill(self, target: Tensor, number: int, name: str, turn: Turn) -> None:
-        source = self._source(number, name)
-        if turn == Turn.NONE:
+    def _fill(self, target: Tensor, number: int, name: str, change: Change) -> None:
+        source = self._source(number, name, change.alone)
+        if change[:4] == UNCHANGED[:4]:
             target.copy_(source)
             return
         # Converting first and turning then is several times faster than both in one strided pass.
-        plain = source.to(torch.float32).numpy()
-        np.copyto(target.numpy(), turned(plain, turn))
+        plain = reordered(source.to(torch.float32).numpy(), name, change)
+        if change.turn == Turn.NONE:
+            np.copyto(target.numpy(), plain)
+            return
+        np.copyto(target.numpy(), turned(plain, change.turn))
         if name in IMAGE_PLANE:
-            turn_vectors(target.numpy(), turn)
+            turn_vectors(target.numpy(), change.turn)
 
-    def _source(self, number: int, name: str) -> Tensor:
-        """Return a buffer (C, H, W) of a sample, stored or computed."""
+    def _source(self, number: int, name: str, alone: bool = False) -> Tensor:
+        """Return a buffer (C, H, W) of a sample, stored or computed; `alone`: without history."""
         sample, reader = self.reader.sample(number), self.reader
         stored = sample.buffers
+        if alone and sample.accumulated and {"color", "albedo"} <= stored.keys():
+            if name == "irradiance":
+                return reader.array(number, "color").float() / reader.array(number, "albedo").float()
+            if name == "color":
+                return reader.array(number, "color")
+            if name == "history":
+                return torch.ones_like(reader.array(number, "history"))
         accumulated_color = self.temporal and sample.accumulated and "color" in self.inputs
         if name == "color" and (name not in stored or accumulated_color):
             return reader.array(number, "irradiance").float() * reader.array(number, "albedo").float()

@@ -8,6 +8,7 @@ whole batches and keeps no state.
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from data.shards.batch import Batch, Batches, Order
+from data.shards.batch import Batch, Batches, Order, Packed
 from data.shards.plan import batches_per_epoch, evaluation_samples, training_epoch
 
 logger = logging.getLogger("data")
@@ -50,6 +51,7 @@ class _Loader:
     def __init__(self, batches: Batches, workers: int, pin_memory: bool) -> None:
         self.batches, self.workers, self.pin_memory = batches, workers, pin_memory
         self.corrupt: dict[str, str] = {}
+        self.waited_s = 0.0  # seconds that callers have waited for batches so far
         self._orders = _Orders()
         self._inner: DataLoader | None = None
 
@@ -67,7 +69,7 @@ class _Loader:
                 # Its own, so that reading does not advance the random state of the run.
                 generator=torch.Generator(),
             )
-        for packed in self._inner:
+        for packed in self._timed(self._inner):
             if packed.error is not None:
                 raise packed.error
             for sample, reason in packed.corrupt:
@@ -76,6 +78,13 @@ class _Loader:
                     warnings.warn(f"left out ({len(self.corrupt)} so far): {reason}", stacklevel=2)
             if packed.samples:
                 yield packed.unpack()
+
+    def _timed(self, loader: DataLoader) -> Iterator[Packed]:
+        began = time.perf_counter()
+        for packed in loader:
+            self.waited_s += time.perf_counter() - began
+            yield packed
+            began = time.perf_counter()
 
     def close(self) -> None:
         """End the worker processes; iterating starts them again."""

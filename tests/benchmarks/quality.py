@@ -70,7 +70,11 @@ def picture(images: dict[str, Any], path: Path) -> None:
     arrays = {name: images[name][0].permute(1, 2, 0).numpy() for name in (*NAMES, "reference")}
     path.parent.mkdir(parents=True, exist_ok=True)
     comparison(
-        arrays["noisy"], arrays["accumulated"], arrays["WSKP"], arrays["reference"], float(images["exposure"][0])
+        arrays["noisy"],
+        arrays["accumulated"],
+        arrays["WSKP"],
+        arrays["reference"],
+        float(images["exposure"][0]),
     ).save(path)
 
 

@@ -29,7 +29,8 @@ def test_configuration_has_a_header_and_stays_short(name):
 def test_configuration_trains_for_one_step(name, tmp_path):
     command = [
         sys.executable, "-m", "trainer", "fit", "--config", name, "--config", "smoke.yaml",
-        "--trainer.limit_train_batches", "1", "--data.init_args.batch_size", "1", "--data.init_args.workers", "0",
+        "--trainer.limit_train_batches", "1", "--data.init_args.batch_size", "1",
+        "--data.init_args.workers", "0",
     ]  # fmt: skip
     done = subprocess.run(
         command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "2"}, capture_output=True, text=True

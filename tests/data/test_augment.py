@@ -5,7 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from data.augment import LEFT, RIGHT, Augmentation, Turn, turn_vectors, turned
+from data.augment import LEFT, RIGHT, Augmentation, Turn, reordered, turn_vectors, turned
+from data.buffers import buffer
 
 IMAGE = np.arange(2 * 4 * 4, dtype=np.float32).reshape(2, 4, 4)
 
@@ -72,3 +73,50 @@ def test_unknown_rules_and_negative_stops_are_refused():
         Augmentation("mirror")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="expected 0 to 16"):
         Augmentation(exposure_stops=-1)
+
+
+def test_permutation_is_the_same_for_radiance_and_reflectance_so_the_product_still_holds():
+    augmentation = Augmentation("none", seed=3, permute=True)
+    rng = np.random.default_rng(0)
+    irradiance, albedo = rng.random((2, 3, 4, 4), dtype=np.float32)
+    seen = set()
+    for sample in range(60):
+        change = augmentation.change(0, sample)
+        parts = [
+            reordered(image, name, change) for image, name in ((irradiance, "irradiance"), (albedo, "albedo"))
+        ]
+        product = reordered(irradiance * albedo, "reference", change)
+        assert np.array_equal(parts[0] * parts[1], product)
+        seen.add(change.colors)
+    assert len(seen) == 6
+
+
+def test_world_axes_change_by_all_symmetries_of_a_cube_and_keep_lengths_and_angles():
+    augmentation = Augmentation("none", seed=1, permute=True)
+    normals = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0].astype(np.float32)[:, :, None]
+    seen = set()
+    for sample in range(600):
+        change = augmentation.change(2, sample)
+        turned_normals = reordered(normals, "normal", change)[:, :, 0]
+        assert np.allclose(turned_normals.T @ turned_normals, np.eye(3), atol=1e-6)
+        seen.add((change.axes, change.signs))
+    assert len(seen) == 48
+
+
+def test_depth_motion_and_history_keep_their_channels():
+    change = Augmentation("none", permute=True).change(0, 1)
+    for name in ("depth", "motion", "history"):
+        image = np.ones((buffer(name).channels, 2, 2), np.float32)
+        assert reordered(image, name, change) is image
+
+
+def test_history_is_dropped_with_the_given_probability_and_never_at_zero():
+    dropped = [Augmentation(drop_history=0.25, seed=5).change(0, n).alone for n in range(2000)]
+    assert 0.2 < np.mean(dropped) < 0.3
+    assert not any(Augmentation(seed=5).change(0, n).alone for n in range(200))
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5])
+def test_impossible_probability_of_dropped_history_is_refused(value):
+    with pytest.raises(ValueError, match="drop_history"):
+        Augmentation(drop_history=value)

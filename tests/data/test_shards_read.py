@@ -88,6 +88,31 @@ def test_a_net_without_history_gets_the_irradiance_of_the_frame_alone(index: Ind
     assert torch.equal(batch["irradiance"], batch["color"] / batch["albedo"])
 
 
+def test_dropped_history_leaves_the_irradiance_of_the_frame_alone_with_a_history_of_one(index: Index):
+    reader = ShardReader(index, "train")
+    names = ("irradiance", "history", "color", "albedo", "normal")
+    orders = Order(0, tuple(range(len(reader))))
+    always = Augmentation("none", drop_history=1.0)
+    dropped = Batches(reader, names, True, augmentation=always)[orders].unpack()
+    assert torch.equal(dropped["irradiance"], dropped["color"] / dropped["albedo"])
+    assert (dropped["history"] == 1).all()
+    kept = Batches(reader, names, True, augmentation=Augmentation("none"))[orders].unpack()
+    assert not torch.equal(kept["irradiance"], dropped["irradiance"])
+    assert torch.equal(kept["albedo"], dropped["albedo"])
+
+
+def test_permuted_samples_keep_radiance_equal_to_irradiance_times_albedo(index: Index):
+    reader = ShardReader(index, "train")
+    batches = Batches(reader, ("irradiance", "color", "albedo", "normal"), False,
+                      augmentation=Augmentation("dihedral", seed=4, permute=True))  # fmt: skip
+    batch = batches[Order(3, tuple(range(len(reader))))].unpack()
+    assert torch.allclose(batch["irradiance"] * batch["albedo"], batch["color"], rtol=1e-5, atol=1e-7)
+    lengths = torch.linalg.vector_norm(batch["normal"], dim=1)
+    plain = Batches(reader, ("normal",), True)[Order(0, tuple(range(len(reader))))].unpack()["normal"]
+    expected = torch.linalg.vector_norm(plain, dim=1)
+    assert torch.allclose(lengths.flatten(1).sort()[0], expected.flatten(1).sort()[0], atol=1e-6)
+
+
 def test_a_temporal_net_that_reads_color_gets_it_accumulated(index: Index):
     reader = ShardReader(index, "test")
     batch = Batches(reader, NAMES, temporal=True, inputs=("color",))[Order(0, (2,))].unpack()

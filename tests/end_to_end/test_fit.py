@@ -34,7 +34,7 @@ def test_one_finished_run_with_checkpoints_and_exports(trained):
 
 
 def test_run_says_what_it_was(run):
-    client, tracked = run
+    _, tracked = run
     assert tracked.info.status == "FINISHED"
     parameters, tags = tracked.data.params, tracked.data.tags
     assert parameters["model.init_args.net.class_path"] == "models.WSKP"
@@ -72,10 +72,9 @@ def test_recorded_configuration_trains_again(trained, workplace):
     assert all((first[name] == second[name]).all() for name in first)
 
 
-def test_registered_model_runs_through_pyfunc(trained, run):
+def test_registered_model_runs_through_pyfunc(trained):
     import mlflow
 
-    client, tracked = run
     mlflow.set_tracking_uri(f"sqlite:///{trained.folder / 'runs' / 'mlflow.db'}")
     model = mlflow.pyfunc.load_model("models:/wskp/1")
     assert model.metadata.signature is not None

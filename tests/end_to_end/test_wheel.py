@@ -40,7 +40,9 @@ def test_installed_wheel_trains_in_an_empty_environment_from_another_directory(w
     environment |= {"PENUMBRA_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "2"}
 
     def run(*command):
-        done = subprocess.run(command, cwd=tmp_path / "elsewhere", env=environment, capture_output=True, text=True)
+        done = subprocess.run(
+            command, cwd=tmp_path / "elsewhere", env=environment, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
         return done.stdout + done.stderr
 
@@ -48,7 +50,14 @@ def test_installed_wheel_trains_in_an_empty_environment_from_another_directory(w
     # The constraints pin the versions; torch comes first so that a CPU build already there is kept.
     constraints = ("--constraint", str(ROOT / "constraints.txt"))
     run(python, "-m", "pip", "install", "--quiet", *constraints, "torch==2.13.0", str(wheel))
-    run(str(tmp_path / "env" / "bin" / "trainer"), "fit", "--config", "wskp_bmfr.yaml", "--config", "smoke.yaml")
+    run(
+        str(tmp_path / "env" / "bin" / "trainer"),
+        "fit",
+        "--config",
+        "wskp_bmfr.yaml",
+        "--config",
+        "smoke.yaml",
+    )
     assert list((tmp_path / "elsewhere" / "runs").glob("wskp_bmfr/*/export/wskp.onnx"))
     location = run(python, "-c", "import models; print(models.__file__)").strip()
     assert location.startswith(str(tmp_path / "env"))

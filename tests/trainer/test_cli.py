@@ -64,9 +64,7 @@ def test_misspelt_option_is_an_error_that_names_the_nearest(monkeypatch, capsys,
 def test_misspelt_key_in_a_file_is_an_error_that_names_the_nearest(monkeypatch, capsys, tmp_path):
     overlay = tmp_path / "overlay.yaml"
     overlay.write_text("model:\n  init_args:\n    net:\n      init_args:\n        widht: 14\n")
-    code, printed = run(
-        monkeypatch, capsys, "fit", "--config", "wskp_bmfr.yaml", "--config", str(overlay)
-    )
+    code, printed = run(monkeypatch, capsys, "fit", "--config", "wskp_bmfr.yaml", "--config", str(overlay))
     assert code == 2
     assert "width'?" in printed.err
 
@@ -91,7 +89,13 @@ def test_print_config_shows_defaults_file_and_overrides(monkeypatch, capsys):
         cli.main()
     text = capsys.readouterr().out
     assert stop.value.code in (0, None)
-    for part in ("root: sample:bmfr", "batch_size: 3", "trainer.tracking.MLflowTracking", "layers: 6", "SMAPE"):
+    for part in (
+        "root: sample:bmfr",
+        "batch_size: 3",
+        "trainer.tracking.MLflowTracking",
+        "layers: 6",
+        "SMAPE",
+    ):
         assert part in text, part
 
 

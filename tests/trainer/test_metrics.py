@@ -35,13 +35,14 @@ def literal_ssim(x, y, data_range):
 @pytest.mark.parametrize(("metric", "data_range"), [(ssim_wskp, 2.0), (ssim_wskp_range1, 1.0)])
 def test_ssim_equals_a_window_by_window_transcription(metric, data_range):
     output, reference = pair()
-    expected = [literal_ssim(display(o), display(r), data_range) for o, r in zip(output, reference)]
+    pairs = zip(output, reference, strict=True)
+    expected = [literal_ssim(display(o), display(r), data_range) for o, r in pairs]
     assert metric(output, reference).numpy() == pytest.approx(expected, abs=1e-6)
 
 
 def test_psnr_is_on_gamma_images_with_peak_one_per_image():
     output, reference = pair()
-    errors = [np.mean((display(o) - display(r)) ** 2) for o, r in zip(output, reference)]
+    errors = [np.mean((display(o) - display(r)) ** 2) for o, r in zip(output, reference, strict=True)]
     assert psnr_wskp(output, reference).numpy() == pytest.approx(-10 * np.log10(errors), abs=1e-4)
 
 

@@ -27,7 +27,7 @@ def free_port():
 
 @pytest.fixture
 def server(tmp_path):
-    """A real tracking server on loopback; yields its URI and a function that kills it."""
+    """A real tracking server on loopback; its URI, and functions that start and kill it."""
     port = free_port()
     uri = f"http://127.0.0.1:{port}"
     folder = tmp_path / "server"
@@ -41,7 +41,11 @@ def server(tmp_path):
 
     def start():
         process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+            command,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         for _ in range(240):
             try:
@@ -55,7 +59,7 @@ def server(tmp_path):
         os.killpg(process.pid, 9)  # the server and its own workers: the group that was started above
         process.wait()
 
-    yield uri, start, stop
+    return uri, start, stop
 
 
 def arguments(folder, to=None):
@@ -109,7 +113,7 @@ def test_upload_to_an_unreachable_server_fails_and_changes_nothing():
     logger = MLflowTracking("exp", system_metrics=False)
     logger.log_metrics({"loss": 1.0}, step=0)
     before = (logger.folder / "run.json").read_text()
-    with pytest.raises(ValueError, match="cannot be reached .* nothing was sent"):
+    with pytest.raises(ValueError, match=r"cannot be reached .* nothing was sent"):
         upload.run(arguments(logger.folder, to=f"http://127.0.0.1:{free_port()}"))
     assert (logger.folder / "run.json").read_text() == before
 
@@ -148,7 +152,10 @@ def test_server_lost_in_mid_run_loses_nothing_and_upload_completes_its_run(serve
         assert upload.run(arguments(logger.folder)) == 0
         client = open_client(uri)
         run = client.get_run(remote_id)
-        assert [(m.step, m.value) for m in client.get_metric_history(remote_id, "loss")] == [(0, 3.0), (1, 2.0)]
+        assert [(m.step, m.value) for m in client.get_metric_history(remote_id, "loss")] == [
+            (0, 3.0),
+            (1, 2.0),
+        ]
         assert run.data.params == {"lr": "0.001", "width": "14"}
         assert run.info.status == "FINISHED"
         assert [f.path for f in client.list_artifacts(remote_id)] == ["note.txt"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -30,7 +32,9 @@ class ExportBest(Callback):
         if not trainer.is_global_zero or not isinstance(logger, MLflowTracking):
             return
         checkpoints = logger.folder / "checkpoints"
-        chosen = next((p for p in (checkpoints / "best.ckpt", checkpoints / "last.ckpt") if p.is_file()), None)
+        chosen = next(
+            (p for p in (checkpoints / "best.ckpt", checkpoints / "last.ckpt") if p.is_file()), None
+        )
         if chosen is None:
             return
         logger.log_file(chosen, "checkpoints")
@@ -45,20 +49,24 @@ class ExportBest(Callback):
             )
 
     def _export(self, logger: MLflowTracking, checkpoint: Path) -> None:
-        from trainer.export import SUFFIXES, Source, export
-        from trainer.export.register import log_and_register
-        from trainer.loading import load_model
+        from trainer.export import SUFFIXES, export
+        from trainer.loading import resolve
 
-        net = load_model(str(checkpoint))
-        source = Source(str(checkpoint), f"{type(net).__module__}.{type(net).__name__}")
+        loaded = resolve(str(checkpoint))
         folder = logger.folder / "export"
         for format in self.formats:
             path = folder / f"{logger.registered_model or 'model'}{SUFFIXES[format]}"
-            parity = export(net, path, format, source=source, force=True)  # type: ignore[arg-type]
+            parity = export(loaded.model, path, format, source=loaded.source, force=True)  # type: ignore[arg-type]
             print(f"exported {path} (differs from eager by {parity.error:.1e})", file=sys.stderr)
             logger.log_file(path, "export")
             logger.set_tags({f"export.{format}.parity": f"{parity.error:.3e}"})
             if format == "onnx" and self.register and logger.registered_model:
                 name = logger.registered_model
-                version = logger.call(lambda c, run, p=path, n=name: log_and_register(run, p, n, logger.uri))
+                version = logger.call(partial(_register, logger, path, name))
                 print(f"registered models:/{name}/{version}", file=sys.stderr)
+
+
+def _register(logger: MLflowTracking, path: Path, name: str, client: Any, run_id: str) -> str:
+    from trainer.export.register import log_and_register
+
+    return log_and_register(run_id, path, name, logger.uri)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from models.denoiser import Denoiser
 from trainer.modules.regression import noisy_input
 from trainer.reports.pictures import comparison
 from trainer.tracking import MLflowTracking
@@ -68,9 +69,10 @@ class ValidationPictures(Callback):
     @torch.no_grad()
     def _strip(self, module: LightningModule, batch: dict[str, Any], row: int) -> Any:
         one = {k: v[row : row + 1] for k, v in batch.items() if isinstance(v, torch.Tensor)}
+        net = cast(Denoiser, module.net)
         images = {
             "noisy": one.get("color"),
-            "accumulated": noisy_input(module.net, one) if module.net.temporal else None,  # type: ignore[union-attr]
+            "accumulated": noisy_input(net, one) if net.temporal else None,
             "denoised": module(one).color,
             "reference": one["reference"],
         }

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         run_id = sink.create_run(experiment, run_name=record.name).info.run_id
         record.server_run_id = run_id
         record.save(arguments.run)  # an upload that is interrupted continues in the same run
-    local = source.get_run(record.run_id)
+    local = source.get_run(record.run_id or "")
     metrics = _copy_numbers(source, sink, local, run_id)
     files = _copy_artifacts(source, sink, local, run_id)
     _register(sink, target, run_id, arguments.run)

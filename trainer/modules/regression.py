@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from models.denoiser import Denoised, Denoiser, select
 from trainer.losses import SMAPE
 from trainer.metrics.collection import METRICS, SceneMetrics
+from trainer.schedules import OneCycle
 
 Batch = dict[str, Any]
 
@@ -29,7 +31,8 @@ class Regression(LightningModule):
         net: The denoiser to train.
         loss: Module called with exposed output and target (B, 3, H, W).
         optimizer: Makes the optimiser from the parameters; a class path in a configuration.
-        lr_scheduler: Makes a learning-rate schedule, stepped once per epoch; none by default.
+        lr_scheduler: Makes a learning-rate schedule: `trainer.schedules.OneCycle` is stepped after every
+            step, the schedules of PyTorch after every epoch; none by default.
     """
 
     def __init__(
@@ -40,7 +43,11 @@ class Regression(LightningModule):
         lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        with warnings.catch_warnings():
+            # Lightning would rather not save modules; in a configuration they are class paths, which rebuild
+            # the network from the checkpoint alone.
+            warnings.filterwarnings("ignore", "Attribute '.*' is an instance of `nn.Module`")
+            self.save_hyperparameters()
         self.net = net
         self.loss = loss if loss is not None else SMAPE()
         self.make_optimizer = optimizer
@@ -108,7 +115,21 @@ class Regression(LightningModule):
         optimizer = self.make_optimizer(self.net.parameters())
         if self.make_lr_scheduler is None:
             return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": self.make_lr_scheduler(optimizer)}
+        schedule = self.make_lr_scheduler(optimizer)
+        interval = "epoch"
+        if isinstance(schedule, OneCycle):
+            schedule.span(int(self.trainer.estimated_stepping_batches))
+            interval = "step"
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": interval}}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep objects out of the checkpoint, so that it is read without pickle.
+
+        From a configuration the hyper-parameters are class paths, and the checkpoint alone rebuilds the
+        network; a module that was made in Python is loaded with `load_from_checkpoint(path, net=…)`.
+        """
+        saved = checkpoint.get("hyper_parameters", {})
+        checkpoint["hyper_parameters"] = {key: value for key, value in saved.items() if _is_plain(value)}
 
     def _new_scores(self, split: str) -> SceneMetrics:
         scenes = self.trainer.datamodule.scenes(split)  # type: ignore[attr-defined]
@@ -120,6 +141,14 @@ class Regression(LightningModule):
             for name in METRICS:
                 key = f"{prefix}/{name}" if scene == "average" else f"{prefix}/{name}/{scene}"
                 self.log(key, row[name], sync_dist=False, batch_size=1)
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(_is_plain(item) for item in value.values())
+    if isinstance(value, list | tuple):
+        return all(_is_plain(item) for item in value)
+    return value is None or isinstance(value, str | int | float | bool)
 
 
 def noisy_input(net: Denoiser, batch: Batch) -> Tensor:

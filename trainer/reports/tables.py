@@ -29,7 +29,9 @@ def scores_by_scene(logged: Mapping[str, Any], prefix: str) -> dict[str, dict[st
 def scores_table(logged: Mapping[str, Any], prefix: str) -> Table:
     """Return a table with one row per scene and method: the noisy input and the denoised frames."""
     titles = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
-    table = Table(title=titles.get(prefix, prefix), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(
+        title=titles.get(prefix, prefix), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     table.add_column("scene", no_wrap=True)
     table.add_column("image", no_wrap=True)
     for name, higher in HIGHER_IS_BETTER.items():

@@ -1,0 +1,99 @@
+import os
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+
+from models import WSKP
+from tests.synthetic import Synthetic, patch
+from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint
+from trainer.callbacks.progress import TrainingProgress, duration
+from trainer.callbacks.recorder import flatten, git_state, installed
+from trainer.modules import Regression
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+    pytest.mark.filterwarnings("ignore:.*smaller than the logging interval"),
+]
+
+
+def small_trainer(folder, *callbacks, **options):
+    return Trainer(
+        default_root_dir=folder, max_epochs=1, logger=False, callbacks=list(callbacks), accelerator="cpu",
+        enable_model_summary=False, num_sanity_val_steps=0, **options,
+    )  # fmt: skip
+
+
+def test_killed_writer_leaves_the_previous_checkpoint_whole(tmp_path, monkeypatch):
+    path = tmp_path / "last.ckpt"
+    writer = AtomicCheckpointIO()
+    writer.save_checkpoint({"step": 1}, path)
+
+    def interrupted(source, target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        writer.save_checkpoint({"step": 2}, path)
+    assert torch.load(path, weights_only=True) == {"step": 1}
+    assert os.listdir(tmp_path) == ["last.ckpt"]
+
+
+def test_full_disk_is_an_error_that_names_the_checkpoint(tmp_path, monkeypatch):
+    real = torch.save
+    monkeypatch.setattr(torch, "save", lambda data, path: real(data, "/dev/full"))
+    with pytest.raises(OSError, match=r"cannot write checkpoint .*last\.ckpt"):
+        AtomicCheckpointIO().save_checkpoint({"w": torch.zeros(1 << 16)}, tmp_path / "last.ckpt")
+    assert os.listdir(tmp_path) == []
+
+
+class _Poisoned(Synthetic):
+    def train_dataloader(self):
+        bad = patch(0)
+        bad["irradiance"] = bad["irradiance"].clone()
+        bad["irradiance"][0, 3, 3] = float("nan")
+        return torch.utils.data.DataLoader([patch(1), bad], 1)
+
+
+def test_first_loss_that_is_not_finite_stops_with_the_batch_saved(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"loss became nan at step 2; not finite in the batch: irradiance"):
+        small_trainer(tmp_path, FiniteGuard(), limit_val_batches=0).fit(
+            Regression(WSKP(layers=3)), datamodule=_Poisoned()
+        )
+    saved = torch.load(next(tmp_path.glob("nonfinite-step*.pt")), weights_only=True)
+    assert torch.isnan(saved["irradiance"]).any()
+    assert saved["scene"] == ["step"]
+
+
+def test_last_checkpoint_holds_the_end_of_training_whatever_the_interval(tmp_path):
+    callback = LastCheckpoint(every_n_train_steps=3)
+    callback.dirpath = str(tmp_path)
+    small_trainer(tmp_path, callback).fit(Regression(WSKP(layers=3)), datamodule=Synthetic())
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 4
+
+
+def test_plain_lines_tell_rate_waiting_loss_and_time_left(tmp_path, capsys):
+    progress = TrainingProgress(plain_interval_s=0.0)
+    trainer = small_trainer(tmp_path, progress, log_every_n_steps=1)
+    trainer.fit(Regression(WSKP(layers=3)), datamodule=Synthetic())
+    lines = capsys.readouterr().err.splitlines()
+    step = next(line for line in lines if "step 4/4" in line)
+    assert all(word in step for word in ("patches/s", "waiting", "loss", "left"))
+    assert any("validation PSNR" in line for line in lines)
+    assert 0 <= float(trainer.logged_metrics["throughput/waiting"]) <= 1
+
+
+def test_durations_read_as_people_say_them():
+    assert [duration(s) for s in (7.4, 65, 3723)] == ["7 s", "1:05", "1:02:03"]
+
+
+def test_flattened_configuration_has_dotted_names_and_no_empty_values():
+    tree = {"a": {"b": 1, "c": None}, "list": [{"class_path": "x.Y"}, {"class_path": "z.W"}], "config": ["f"]}
+    assert flatten(tree) == {"a.b": 1, "list": "x.Y, z.W"}
+
+
+def test_record_of_the_environment_lists_what_is_installed_and_the_commit(tmp_path):
+    assert any(line.lower().startswith("torch==") for line in installed())
+    state = git_state(tmp_path)
+    assert state == {} or len(state["git.commit"]) == 40

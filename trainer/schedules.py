@@ -1,0 +1,47 @@
+"""Learning-rate schedules that span the whole training, however long it is."""
+
+from __future__ import annotations
+
+import math
+
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+
+class OneCycle(LambdaLR):
+    """One rise and one fall of the learning rate, both along a cosine (Smith and Topin 2019).
+
+    The optimiser's own learning rate is the peak. The number of steps is not an argument: the training
+    module sets it from the trainer (`span`), so longer training stretches the cycle.
+
+    Args:
+        optimizer: Whose learning rate is scheduled.
+        warmup: Share of the steps that the rate rises.
+        start: First rate as a fraction of the peak.
+        end: Last rate as a fraction of the peak.
+
+    Raises:
+        ValueError: `warmup` is not within [0, 1), or `start` or `end` not within (0, 1].
+    """
+
+    def __init__(
+        self, optimizer: Optimizer, warmup: float = 0.15, start: float = 0.1, end: float = 0.001
+    ) -> None:
+        if not (0 <= warmup < 1 and 0 < start <= 1 and 0 < end <= 1):
+            raise ValueError(f"OneCycle: warmup {warmup}, start {start}, end {end} are out of range")
+        self.warmup, self.start, self.end = warmup, start, end
+        self.steps = 1
+        super().__init__(optimizer, self.factor)
+
+    def span(self, steps: int) -> None:
+        """Set the number of optimiser steps of the whole training."""
+        self.steps = max(int(steps), 1)
+
+    def factor(self, step: int) -> float:
+        """Return the learning rate of a step as a fraction of the peak; constant after the last."""
+        place = min(step / self.steps, 1.0)
+        if place < self.warmup:
+            low, share = self.start, place / self.warmup
+        else:
+            low, share = self.end, (1 - place) / (1 - self.warmup)
+        return low + (1 - low) * 0.5 * (1 - math.cos(math.pi * share))
