@@ -31,10 +31,21 @@ class Tileable(Protocol):
     A method may also declare `bytes_per_pixel`, its measured working memory.
     """
 
-    inputs: tuple[str, ...]
-    frame_numbers: tuple[str, ...]
-    halo: int
-    multiple: int
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the buffers that the method reads."""
+
+    @property
+    def frame_numbers(self) -> tuple[str, ...]:
+        """Names of the frame numbers that it reads when they are given."""
+
+    @property
+    def halo(self) -> int:
+        """Pixels of context on each side that an output pixel depends on."""
+
+    @property
+    def multiple(self) -> int:
+        """Height and width must divide by it."""
 
     def measure(self, buffers: Mapping[str, Tensor], /) -> Mapping[str, Tensor]:
         """Return the numbers that need the whole frame."""

@@ -17,7 +17,7 @@ from models.denoiser import Buffers
 def dense_reconstruct(
     irradiance: Tensor, log_importance: Tensor, fusion_logits: Tensor, kernel_sizes: Sequence[int]
 ) -> Tensor:
-    """Sum every window with a k x k convolution of ones, each colour channel by itself, exp without a shift."""
+    """Sum every window with a k x k convolution of ones, colour channels one by one, exp without a shift."""
     batch, _, height, width = irradiance.shape
     importance, fusion = log_importance.exp(), fusion_logits.softmax(1)
     total = torch.zeros_like(irradiance)

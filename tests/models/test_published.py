@@ -45,6 +45,7 @@ def authors_network(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> T
     layers = len({re.split("_[135]", name)[0] for name in weights})
     for layer in range(1, layers):
         summed = sum(F.conv2d(maps, weights[f"conv{layer}_{k}.weight"], padding=k // 2) for k in (5, 3, 1))
+        assert isinstance(summed, Tensor)
         maps = F.leaky_relu(summed + maps if layer > 1 else summed, 0.1)
     final = sum(F.conv2d(maps, weights[f"conv_final_{k}.weight"], padding=k // 2) for k in (5, 3, 1))
     assert isinstance(final, Tensor)
