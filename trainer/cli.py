@@ -94,6 +94,6 @@ def _check_packages() -> None:
         found = os.path.dirname(os.path.dirname(os.path.abspath(origin))) if origin else None
         if found != place:
             raise ValueError(
-                f"the package {name!r} is taken from {found or 'another folder'}, not from Penumbra ({place}); "
-                "start the command from another directory or use an environment of its own"
+                f"the package {name!r} is taken from {found or 'another folder'}, not from Penumbra "
+                f"({place}); start the command elsewhere or use an environment of its own"
             )
