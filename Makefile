@@ -15,7 +15,7 @@ DEV_READY = $(VENV)/.ready-dev
 fit: $(READY)
 	$(BIN)/trainer fit --config wskp_bmfr.yaml
 	$(BIN)/trainer test --config wskp_bmfr.yaml
-	$(BIN)/trainer denoise --model best:wskp_bmfr sample:bmfr --split test --output $(OUTPUT) --png --force
+	$(BIN)/trainer denoise --model models:/wskp/latest sample:bmfr --split test --output $(OUTPUT) --png --force
 
 test: $(DEV_READY)
 	$(BIN)/python -m pytest -m "not slow"

@@ -42,6 +42,9 @@ def usage() -> str:
 
 def main() -> int:
     """Run the command line `sys.argv` and return the exit code: 0 done, 1 failed, 2 wrong usage."""
+    # Threads that spin while they wait take the cores from each other as soon as a loader's worker or any
+    # other program runs; must be set before PyTorch is loaded.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage())

@@ -57,6 +57,7 @@ def main(names: list[str]) -> int:
     if unknown:
         print(f"unknown benchmark {', '.join(sorted(unknown))}; known: {', '.join(MODULES)}", file=sys.stderr)
         return 2
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the trainer command does, before torch
     about, rows = machine(), []
     for name in names or MODULES:
         print(f"running {name} …", file=sys.stderr, flush=True)
