@@ -1,7 +1,7 @@
 # Two commands do everything on a fresh machine: `make fit` and `make test`.
 PYTHON ?= python3.11
 VENV ?= .venv
-# A CPU build of PyTorch. For CUDA: make fit TORCH=torch==2.13.0 TORCH_INDEX=
+# A CPU build of PyTorch. For CUDA: make clean; make fit TORCH=torch==2.13.0
 TORCH ?= torch==2.13.0+cpu
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 OUTPUT ?= runs/pictures
@@ -51,6 +51,7 @@ $(DEV_READY): $(READY)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	@touch $@
 
+# Leaves runs/ alone: those are results.
 clean:
-	rm -rf $(VENV) runs bench dist build .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) bench dist build .mypy_cache .ruff_cache .pytest_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,7 +10,8 @@ from lightning.pytorch import LightningDataModule
 from data.augment import Augmentation, Rule
 from data.buffers import buffer
 from data.manifest import load_manifest
-from data.root import resolve_root
+from data.root import SAMPLE, resolve_root
+from data.sample import TRAIN_PATCHES
 from data.shards.batch import Batches, available
 from data.shards.cut import PrepareOptions
 from data.shards.index import Index
@@ -44,7 +45,8 @@ class Shards(LightningDataModule):
         exposure_stops: Vary the exposure of training patches by up to so many stops up and down.
         permute: Permute colour channels and world axes of training patches.
         drop_history: Share of training patches whose input is not accumulated.
-        train_patches: Training patches per 1280x720 frame, where the root is prepared here.
+        train_patches: Training patches per 1280x720 frame, where the root is prepared here; None: 80 as in
+            WSKP, and for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES`.
         validation_patches: Validation patches per 1280x720 frame, where the root is prepared here.
         patch_size: Width and height of patches, where the root is prepared here.
         on_corrupt: What to do about a damaged sample: `raise` an error, or `skip` it, with a warning for
@@ -68,7 +70,7 @@ class Shards(LightningDataModule):
         exposure_stops: float = 0.0,
         permute: bool = False,
         drop_history: float = 0.0,
-        train_patches: int = 80,
+        train_patches: int | None = None,
         validation_patches: int = 20,
         patch_size: int = 128,
         on_corrupt: Literal["raise", "skip"] = "raise",
@@ -88,6 +90,8 @@ class Shards(LightningDataModule):
             if augment
             else Augmentation("none", seed=seed)
         )
+        if train_patches is None:
+            train_patches = TRAIN_PATCHES if root.startswith(SAMPLE) else PrepareOptions().train_patches
         self.options = PrepareOptions(
             patch_size=patch_size,
             train_patches=train_patches,
@@ -190,6 +194,11 @@ class Shards(LightningDataModule):
         if self.index.count(split) == 0:
             return []
         rank, world = self._place()
+        if self.index.count(split) < world:
+            # A rank without a batch would leave the others waiting for its share of the metrics.
+            raise ValueError(
+                f"{self.index.count(split)} {split} samples for {world} processes; use fewer devices"
+            )
         loader = EvaluationLoader(
             self._batches(split, None),
             batch_size,

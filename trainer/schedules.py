@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -36,6 +37,11 @@ class OneCycle(LambdaLR):
     def span(self, steps: int) -> None:
         """Set the number of optimiser steps of the whole training."""
         self.steps = max(int(steps), 1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the position; shape and length follow from the configuration, also of a resumed run."""
+        own = ("steps", "warmup", "start", "end")
+        return {key: value for key, value in super().state_dict().items() if key not in own}
 
     def factor(self, step: int) -> float:
         """Return the learning rate of a step as a fraction of the peak; constant after the last."""

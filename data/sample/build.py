@@ -23,7 +23,7 @@ from data.manifest import Manifest, SceneRecord
 from data.sample import SAMPLES
 
 FRAMES = 9
-TEST = "living-room-2"
+TEST = "classroom"
 LIMIT_BYTES = 20_000_000
 
 MANTISSA_BITS = {"position": 10}

@@ -180,7 +180,7 @@ class Batches(Dataset[Packed]):
         stored = sample.buffers
         if alone and sample.accumulated and {"color", "albedo"} <= stored.keys():
             if name == "irradiance":
-                return reader.array(number, "color").float() / reader.array(number, "albedo").float()
+                return self._demodulated(number)
             if name == "color":
                 return reader.array(number, "color")
             if name == "history":
@@ -189,8 +189,13 @@ class Batches(Dataset[Packed]):
         if name == "color" and (name not in stored or accumulated_color):
             return reader.array(number, "irradiance").float() * reader.array(number, "albedo").float()
         if name == "irradiance" and (name not in stored or (sample.accumulated and not self.temporal)):
-            return reader.array(number, "color").float() / reader.array(number, "albedo").float()
+            return self._demodulated(number)
         return reader.array(number, name)
+
+    def _demodulated(self, number: int) -> Tensor:
+        """Return color / albedo, and 0 where a published albedo is 0: multiplied back that is 0 as well."""
+        color, albedo = (self.reader.array(number, name).float() for name in ("color", "albedo"))
+        return torch.where(albedo > 0, color / albedo.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
 
 
 def available(sample: Sample) -> tuple[str, ...]:

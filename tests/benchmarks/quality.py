@@ -4,7 +4,7 @@ Denoises the test frames with the best checkpoint of the newest `wskp_bmfr` run 
 (`make fit` leaves one; without one it is trained here, and timed) and with the joint bilateral filter, and
 compares both with the temporally accumulated input. The picture of the README comes from here too.
 
-    python -m tests.benchmarks.quality [--picture FILE] [--checkpoint FILE]
+    python -m tests.benchmarks.quality [--checkpoint FILE] [--picture FILE] [--readme README.md]
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from models.denoiser import Denoiser, select
 from trainer.loading import load_model
 from trainer.metrics.collection import METRICS, SceneMetrics
 from trainer.modules.regression import noisy_input
-from trainer.runs import find_checkpoint
+from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint
+from trainer.tracking import open_client
 
 NAMES = ("noisy", "accumulated", "joint bilateral", "WSKP")
+MARKERS = ("<!-- quality -->", "<!-- /quality -->")
 BY_ACCUMULATED_DB, BY_BILATERAL_DB = 4.0, 1.0
 
 
@@ -43,7 +45,7 @@ def checkpoint() -> tuple[Path, float | None]:
 @torch.inference_mode()
 def score(net: Denoiser) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
     """Return method → metric → mean over the held-out frames, and the images of the last frame."""
-    module = Shards(workers=0)
+    module = Shards(workers=0)  # the configuration's options, so the same shards
     module.prepare_data()
     scores = {name: SceneMetrics(module.scenes("test")) for name in NAMES}
     bilateral = JointBilateral()
@@ -78,15 +80,51 @@ def picture(images: dict[str, Any], path: Path) -> None:
     ).save(path)
 
 
-def run(given: Path | None = None, target: Path | None = None) -> list[dict[str, Any]]:
+def waiting(checkpoint: Path) -> list[dict[str, Any]]:
+    """Return the share of time that the checkpoint's run waited for data after its first epoch (figure 3)."""
+    folder = folder_of_checkpoint(checkpoint)
+    if folder is None:
+        return []
+    record = RunRecord.load(folder)
+    client = open_client(record.tracking_uri or "")
+    history = client.get_metric_history(record.run_id, "throughput/waiting")
+    epochs = client.get_metric_history(record.run_id, "train/loss_epoch")
+    first_end = min(point.step for point in epochs)
+    shares = [point.value for point in history if point.step > first_end]
+    if not shares:
+        return []
+    mean = sum(shares) / len(shares)
+    return [{"name": "make fit: waiting for data after epoch 0", "value": 100 * mean, "unit": "%",
+             "target": "< 3 %", "meets": mean < 0.03}]  # fmt: skip
+
+
+def write_readme(table: dict[str, dict[str, float]], readme: Path) -> None:
+    """Put the table between the README's two markers."""
+    lines = ["| | " + " | ".join(METRICS) + " |", "|---" * (len(METRICS) + 1) + "|"]
+    for name in NAMES:
+        cells = [
+            f"{table[name][m]:.2f} dB" if m.startswith("psnr") else f"{table[name][m]:.4f}" for m in METRICS
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    before, rest = readme.read_text().split(MARKERS[0])
+    after = rest.split(MARKERS[1])[1]
+    readme.write_text(before + MARKERS[0] + "\n" + "\n".join(lines) + "\n" + MARKERS[1] + after)
+
+
+def run(
+    given: Path | None = None, target: Path | None = None, readme: Path | None = None
+) -> list[dict[str, Any]]:
     """Return the rows of figure 5."""
     path, seconds = (given, None) if given else checkpoint()
     table, images = score(load_model(str(path)))
     if target:
         picture(images, target)
+    if readme:
+        write_readme(table, readme)
     rows: list[dict[str, Any]] = []
     if seconds is not None:
         rows.append({"name": "trainer fit", "value": seconds / 60, "unit": "min", "target": None})
+    rows += waiting(path)
     ours = table["WSKP"]["psnr_wskp"]
     for other, target_db in (("accumulated", BY_ACCUMULATED_DB), ("joint bilateral", BY_BILATERAL_DB)):
         gain = ours - table[other]["psnr_wskp"]
@@ -103,6 +141,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--readme", type=Path)
     options = parser.parse_args()
-    for row in run(options.checkpoint, options.picture):
+    for row in run(options.checkpoint, options.picture, options.readme):
         print(f"{row['name']:45} {row['value']:10.4f} {row['unit']:3} {row.get('target') or ''}")

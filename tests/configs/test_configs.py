@@ -27,13 +27,13 @@ def test_configuration_has_a_header_and_stays_short(name):
 
 @pytest.mark.parametrize("name", [n for n in configs.names() if n not in OVERLAYS])
 def test_configuration_trains_for_one_step(name, tmp_path):
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
+    environment |= {"OMP_NUM_THREADS": "2", "PENUMBRA_CACHE": str(tmp_path / "cache")}
     command = [
         sys.executable, "-m", "trainer", "fit", "--config", name, "--config", "smoke.yaml",
         "--trainer.limit_train_batches", "1", "--data.init_args.batch_size", "1",
-        "--data.init_args.workers", "0",
+        "--data.init_args.workers", "0", "--data.init_args.train_patches", "80",
     ]  # fmt: skip
-    done = subprocess.run(
-        command, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "2"}, capture_output=True, text=True
-    )
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert list(tmp_path.glob("runs/*/*/checkpoints/last.ckpt"))

@@ -2,9 +2,12 @@
 
 import torch
 
-OPTIONS = ("--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "5",
-           "--trainer.limit_val_batches", "2", "--data.init_args.augment", "false",
-           "--data.init_args.batch_size", "2")  # fmt: skip
+OPTIONS = (
+    "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "5",
+    "--trainer.limit_val_batches", "2", "--data.init_args.augment", "false",
+    "--data.init_args.batch_size", "2", "--data.init_args.train_patches", "80", "--model.init_args.lr_scheduler", "null",
+    "--model.init_args.optimizer.init_args.lr", "0.001",
+)  # fmt: skip
 
 
 def one_process(config_net, batches):
@@ -37,7 +40,7 @@ def global_batches(cache, steps):
     try:
         loaders = []
         for rank in range(2):
-            module = Shards(batch_size=2, workers=0, augment=False)
+            module = Shards(batch_size=2, workers=0, augment=False, train_patches=80)
             module.prepare_data()
             loader = module.train_dataloader()
             loader.rank, loader.world = rank, 2

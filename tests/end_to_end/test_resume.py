@@ -10,8 +10,7 @@ import torch
 from trainer.runs import RunRecord
 from trainer.tracking import open_client
 
-# Epochs are short, so that both the middle of an epoch and its end are passed; `max_steps` stops in the
-# middle of the third.
+# Epochs are short, so that both the middle of an epoch and its end are passed.
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "3", "--trainer.limit_train_batches", "7",
     "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "2",

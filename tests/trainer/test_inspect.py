@@ -61,7 +61,7 @@ def test_the_table_of_a_file_names_channels_and_numbers(tmp_path, capsys):
 def test_the_sample_is_described_with_splits_credits_and_checksums(capsys):
     assert call("sample:bmfr") == 0
     text = capsys.readouterr().out
-    assert "train: classroom, cbox-glossy; validation: none; test: living-room-2" in text
+    assert "train: cbox-glossy, living-room-2; validation: none; test: classroom" in text
     assert "checksums: all files match" in text
     assert "NovaZeeke" in text
     assert "derived: irradiance = color / albedo" in text

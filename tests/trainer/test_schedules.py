@@ -43,6 +43,22 @@ def test_restored_schedule_continues():
     assert again.get_last_lr() == schedule.get_last_lr()
 
 
+def test_resuming_with_more_steps_stretches_the_cycle():
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
+    schedule = OneCycle(optimizer)
+    schedule.span(10)
+    for _ in range(10):
+        optimizer.step()
+        schedule.step()
+    longer = OneCycle(torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0))
+    longer.span(100)
+    longer.load_state_dict(schedule.state_dict())
+    longer.optimizer.step()
+    longer.step()
+    assert longer.get_last_lr() == pytest.approx([2.0 * longer.factor(11)])
+    assert longer.factor(11) > 0.1
+
+
 @pytest.mark.parametrize("options", [{"warmup": 1.0}, {"start": 0.0}, {"end": 2.0}])
 def test_impossible_options_are_refused(options):
     with pytest.raises(ValueError, match="out of range"):
