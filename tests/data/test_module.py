@@ -273,6 +273,13 @@ def test_a_buffer_that_the_shards_lack_names_the_command(index: Index):
         module(index, buffers=("motion",)).train_dataloader()
 
 
+def test_fewer_evaluation_samples_than_ranks_is_an_error(index: Index, monkeypatch: pytest.MonkeyPatch):
+    shards = module(index)
+    monkeypatch.setattr(shards, "_place", lambda: (0, 1000))
+    with pytest.raises(ValueError, match="test samples for 1000 processes; use fewer devices"):
+        shards.test_dataloader()
+
+
 def test_more_ranks_than_shards_is_an_error(index: Index, monkeypatch: pytest.MonkeyPatch):
     data = module(index)
     monkeypatch.setattr(data, "_place", lambda: (0, 99))

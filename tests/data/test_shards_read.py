@@ -101,6 +101,18 @@ def test_dropped_history_leaves_the_irradiance_of_the_frame_alone_with_a_history
     assert torch.equal(kept["albedo"], dropped["albedo"])
 
 
+def test_albedo_of_zero_gives_no_irradiance_instead_of_nan(index: Index, monkeypatch: pytest.MonkeyPatch):
+    reader = ShardReader(index, "train")
+    read = reader.array
+
+    def black(number: int, name: str) -> torch.Tensor:
+        return torch.zeros_like(read(number, name)) if name == "albedo" else read(number, name)
+
+    monkeypatch.setattr(reader, "array", black)
+    batch = Batches(reader, ("irradiance",), temporal=False)[Order(0, (0, 1))].unpack()
+    assert (batch["irradiance"] == 0).all()
+
+
 def test_permuted_samples_keep_radiance_equal_to_irradiance_times_albedo(index: Index):
     reader = ShardReader(index, "train")
     batches = Batches(reader, ("irradiance", "color", "albedo", "normal"), False,

@@ -5,9 +5,10 @@ import torch
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "5",
     "--trainer.limit_val_batches", "2", "--data.init_args.augment", "false",
-    "--data.init_args.batch_size", "2", "--data.init_args.train_patches", "80", "--model.init_args.lr_scheduler", "null",
-    "--model.init_args.optimizer.init_args.lr", "0.001",
+    "--data.init_args.batch_size", "2", "--data.init_args.train_patches", "80",
+    "--model.init_args.lr_scheduler", "null", "--model.init_args.optimizer.init_args.lr", "0.001",
 )  # fmt: skip
+
 
 
 def one_process(config_net, batches):
