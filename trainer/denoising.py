@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from data.buffers import buffer
 from data.derive import automatic_exposure, derive
 from data.frame import Frame, Image
 from data.temporal import Accumulator
@@ -60,6 +61,29 @@ class Result:
     noisy: Image
     accumulated: Image | None
     reference: Image | None
+
+
+def replaced_pixels(frame: Frame) -> str | None:
+    """Return which pixels of a frame are not what its file holds, in one sentence; None where all are.
+
+    From `notes["repaired"]`, pixels that were NaN or Inf, and `notes["outside_data_window"]`.
+    """
+    parts = []
+    for name, number in frame.notes.get("repaired", {}).items():
+        neighbours = buffer(name).repair == "neighbours"
+        by = "the mean of their finite neighbours, 0 where there are none" if neighbours else _no_hit(name)
+        parts.append(f"{_pixels(number, name)} NaN or Inf, replaced by {by}")
+    for name, number in frame.notes.get("outside_data_window", {}).items():
+        parts.append(f"{_pixels(number, name)} outside of the data window, replaced by {_no_hit(name)}")
+    return "; ".join(parts) or None
+
+
+def _pixels(number: int, name: str) -> str:
+    return f"{number} pixel{'s' * (number != 1)} of {name} {'was' if number == 1 else 'were'}"
+
+
+def _no_hit(name: str) -> str:
+    return f"{buffer(name).no_hit:g}, the value of a pixel that hit nothing"
 
 
 class ClipDenoiser:

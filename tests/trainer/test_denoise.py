@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from PIL import Image
 
 import models
+from data.buffers import buffer
 from data.camera import Camera
 from data.derive import automatic_exposure, derive
 from data.exr import read_frame, write_frame
@@ -23,7 +25,7 @@ from data.temporal import accumulate
 from models import WSKP
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.tiling import denoise_tiled
-from trainer.clips import find_clips
+from trainer.clips import Item, find_clips
 from trainer.commands import denoise as command
 from trainer.export import export, load_artifact
 from trainer.export.entry import example
@@ -307,6 +309,93 @@ def test_a_picture_given_as_radiance_is_a_note_not_an_error(
     assert "note: " in capsys.readouterr().err
 
 
+def write_raw(path: Path, item: Frame, window: tuple[int, int] | None = None) -> Path:
+    """Write buffers as they are, which `write_frame` refuses for NaN; `window`: the displayed size."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    channels = {
+        f"{name}.{letter}": np.ascontiguousarray(image[..., i])
+        for name, image in item.buffers.items()
+        for i, letter in enumerate(buffer(name).letters)
+    }
+    header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if window is not None:
+        header["displayWindow"] = (np.array([0, 0], np.int32), np.array(window, np.int32) - 1)
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+    return path
+
+
+def test_replaced_pixels_are_told_per_file_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = frame(3)
+    broken.buffers["color"][2, 3:5, 1] = np.nan
+    broken.buffers["normal"][7, 8] = np.inf
+    path = write_raw(tmp_path / "in" / "f003.exr", broken)
+    write_raw(tmp_path / "in" / "f004.exr", frame(4))
+    run("--model", "Exposed", tmp_path / "in", "--output", tmp_path / "out")
+    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note: ")]
+    assert notes == [
+        f"note: {path}: 2 pixels of color were NaN or Inf, replaced by the mean of their finite neighbours, "
+        "0 where there are none; 1 pixel of normal was NaN or Inf, replaced by 0, the value of a pixel that "
+        "hit nothing"
+    ]
+
+
+def test_pixels_outside_of_the_data_window_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = replace(frame(0), buffers={"color": frame(0).buffers["color"]})
+    path = write_raw(tmp_path / "in" / "f000.exr", bare, (WIDTH + 2, HEIGHT))
+    run("--model", "Exposed", path, "--output", tmp_path / "out")
+    assert f"note: {path}: {2 * HEIGHT} pixels of color were outside of the data window, replaced by 0" in (
+        capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (json.JSONDecodeError("Expecting value", "{", 1), ValueError),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), ValueError),
+        (FileNotFoundError(2, "No such file", "x"), OSError),
+    ],
+)
+def test_errors_of_any_class_name_the_frame(error: Exception, kind: type[Exception]) -> None:
+    def read() -> Frame:
+        raise error
+
+    item = Item(read, "in/f000.exr", "f000")
+    with pytest.raises(kind) as caught, command._naming(item, print):
+        item.read()
+    assert str(caught.value) == f"in/f000.exr: {error}"
+    assert caught.value.__cause__ is error
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("fridge", "expected cpu, cuda or cuda:NUMBER"),
+        ("meta", "expected cpu, cuda or cuda:NUMBER"),
+        ("mps", "no mps device"),
+        ("xpu", "no xpu device"),
+        ("cuda:9", "there is no such device, the last one here is cuda:1"),
+        ("cpu:3", "there is no such device, the last one here is cpu:0"),
+    ],
+)
+def test_a_device_that_is_not_there_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, message: str
+) -> None:
+    for backend, number in ((torch.cuda, 2), (torch.mps, 0), (torch.xpu, 0)):
+        monkeypatch.setattr(backend, "is_available", lambda number=number: number > 0)
+        monkeypatch.setattr(backend, "device_count", lambda number=number: number)
+    folder = folder_of(tmp_path / "in", frame(0))
+    with pytest.raises(ValueError, match=f"--device {device}: {message}"):
+        run("--model", "Exposed", folder, "--output", tmp_path / "out", "--device", device)
+    assert not (tmp_path / "out").exists()
+    command._check_device("cuda:1")
+
+
 @pytest.mark.parametrize("content", ["nothing", "shards"])
 def test_a_folder_without_frames_says_what_was_looked_for(tmp_path: Path, content: str) -> None:
     if content == "shards":
@@ -315,12 +404,10 @@ def test_a_folder_without_frames_says_what_was_looked_for(tmp_path: Path, conten
         find_clips([str(tmp_path)])
 
 
-def test_missing_paths_and_devices_and_a_file_as_output_are_errors(tmp_path: Path) -> None:
+def test_missing_paths_and_a_file_as_output_are_errors(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "in", frame(0))
     with pytest.raises(FileNotFoundError, match="no such file"):
         run("--model", "Radiance", tmp_path / "nowhere", "--output", tmp_path / "out")
-    with pytest.raises(ValueError, match="--device fridge"):
-        run("--model", "Radiance", folder, "--output", tmp_path / "out", "--device", "fridge")
     (tmp_path / "file").write_text("x")
     with pytest.raises(ValueError, match="is a file"):
         run("--model", "Radiance", folder, "--output", tmp_path / "file")

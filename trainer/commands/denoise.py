@@ -73,17 +73,17 @@ def run(args: argparse.Namespace) -> int:
         OSError: A file cannot be read or written.
     """
     from trainer.clips import find_clips
-    from trainer.denoising import ClipDenoiser, Settings
+    from trainer.denoising import ClipDenoiser, Settings, replaced_pixels
     from trainer.loading import resolve
     from trainer.outputs import make_folder, refuse_existing
 
+    _check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
     outputs = [path for item in items for path in _outputs(args.output, item, args.png)]
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
     make_folder(args.output)
-    _check_device(args.device)
     loaded = resolve(args.model, args.device)
     number = args.exposure if isinstance(args.exposure, float) else None
     settings = Settings(number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device)
@@ -92,7 +92,10 @@ def run(args: argparse.Namespace) -> int:
             denoiser = ClipDenoiser(loaded, clip, settings, progress.say)
             for item in clip.items:
                 with _naming(item, progress.say):
-                    result = denoiser.step(item.read())
+                    frame = item.read()
+                    if replaced := replaced_pixels(frame):
+                        progress.say(f"{item.label}: {replaced}")
+                    result = denoiser.step(frame)
                 _write(result, args.output, item, args.png)
                 progress.advance(item)
     print(
@@ -139,13 +142,19 @@ def _check_device(device: str) -> None:
     import torch
 
     try:
-        kind = torch.device(device).type
+        wanted = torch.device(device)
+        backend = torch.get_device_module(wanted.type)
     except RuntimeError as error:
         raise ValueError(f"--device {device}: expected cpu, cuda or cuda:NUMBER") from error
-    if kind == "cuda" and not torch.cuda.is_available():
+    number = backend.device_count() if backend.is_available() else 0
+    if number == 0:
+        name = {"cuda": "CUDA"}.get(wanted.type, wanted.type)
         raise ValueError(
-            f"--device {device}: no CUDA device, or a build of PyTorch without CUDA; use --device cpu"
+            f"--device {device}: no {name} device, or a build of PyTorch without {name}; use --device cpu"
         )
+    if (wanted.index or 0) >= number:
+        last = f"{wanted.type}:{number - 1}"
+        raise ValueError(f"--device {device}: there is no such device, the last one here is {last}")
 
 
 @contextmanager
@@ -157,7 +166,9 @@ def _naming(item: Item, say: Callable[[str], None]) -> Iterator[None]:
             yield
         except (ValueError, OSError) as error:
             text = str(error)
-            raise type(error)(text if item.label in text else f"{item.label}: {text}") from error
+            # Not the error's own class: those of subclasses, such as JSONDecodeError, take other arguments.
+            kind = OSError if isinstance(error, OSError) else ValueError
+            raise kind(text if item.label in text else f"{item.label}: {text}") from error
     for warning in caught:
         say(str(warning.message))
 
@@ -216,7 +227,7 @@ class _Progress:
             return
         self.said.add(text)
         if self.bar is not None:
-            self.bar.console.print(f"note: {text}", highlight=False)
+            self.bar.console.print(f"note: {text}", highlight=False, markup=False, soft_wrap=True)
         else:
             print(f"note: {text}", file=sys.stderr)
 
