@@ -257,6 +257,20 @@ def test_automatic_limits_are_of_the_order_that_bmfr_uses():
         assert known / 4 < limit < known * 4
 
 
+def test_automatic_limits_are_those_of_the_second_frame_for_the_whole_sequence():
+    sequence = frames("classroom", 3)
+    limits = [automatic_thresholds(frame).position_limit_squared for frame in sequence]
+    assert len(set(limits)) == 3
+    automatic, given = (list(accumulate(sequence, limit)) for limit in (None, limits[1]))
+    for found, expected in zip(automatic, given, strict=True):
+        assert np.array_equal(found.buffers["irradiance"], expected.buffers["irradiance"])
+    accumulator = Accumulator()
+    for frame in sequence:
+        accumulator.step(frame)
+        assert (accumulator._limits is None) == (frame.index == sequence[0].index)
+    assert accumulator._limits == automatic_thresholds(sequence[1])
+
+
 def test_limits_without_position_or_camera_are_refused():
     frame = still(1)[0]
     frame.camera = None
