@@ -23,6 +23,11 @@ from data.temporal import Accumulator
 BUFFERS = ("color", "irradiance", "albedo", "normal", "depth", "history", "reference")
 """What shards hold of every frame that has it."""
 
+CUT_VERSION = 1
+"""Part of the name of automatically prepared shards. Raise it whenever the same frames and options give
+other samples than before: when accumulation (`data.temporal`), derivation (`data.derive`), repair or cutting
+change. Otherwise shards in a cache, made by the earlier code, would be taken for current ones."""
+
 FRAMES_PER_SHARD = 8
 """Whole frames in a shard of the test split."""
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from data.frames import FrameSet
-from data.shards.cut import PrepareOptions, ShardPlan, make_scene, plan_shards
+from data.shards.cut import CUT_VERSION, PrepareOptions, ShardPlan, make_scene, plan_shards
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
 
 Progress = Callable[[int, int], None]
@@ -67,7 +67,12 @@ def prepare(
             return Index.read(output)
         _check_output(output, force)
         work = output.with_name(output.name + ".partial")
-        identity = {"version": VERSION, "manifest_hash": frames.manifest.hash, "options": options.to_dict()}
+        identity = {
+            "version": VERSION,
+            "cut_version": CUT_VERSION,
+            "manifest_hash": frames.manifest.hash,
+            "options": options.to_dict(),
+        }
         _open_work(work, identity, force)
         plans = plan_shards(frames, options)
         records = _make_all(frames, work, plans, options, processes, progress or (lambda done, total: None))
@@ -99,7 +104,7 @@ def prepare_cached(root: Path, options: PrepareOptions, progress: Progress | Non
 def cached_path(root: Path, options: PrepareOptions) -> Path:
     """Return the cache folder of a data set with these options."""
     manifest = FrameSet(root).manifest
-    text = json.dumps([VERSION, manifest.hash, options.to_dict()], sort_keys=True)
+    text = json.dumps([VERSION, CUT_VERSION, manifest.hash, options.to_dict()], sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     return cache_folder() / "shards" / f"{root.absolute().name}-{key}"
 
@@ -205,6 +210,7 @@ def _open_work(work: Path, identity: dict[str, Any], force: bool) -> None:
         if json.loads(path.read_text(encoding="utf-8")) == identity:
             for left in (work / "shards").glob(".*.partial"):
                 left.unlink(missing_ok=True)
+            _make_work_folders(work)  # an end between publishing and removing leaves the records alone
             return
         if not force:
             raise ValueError(
@@ -213,15 +219,21 @@ def _open_work(work: Path, identity: dict[str, Any], force: bool) -> None:
             )
     if work.is_dir():
         shutil.rmtree(work)
-    (work / "shards").mkdir(parents=True)
-    (work / "records").mkdir()
+    _make_work_folders(work)
     write_json(path, identity)
+
+
+def _make_work_folders(work: Path) -> None:
+    for name in ("shards", "records"):
+        (work / name).mkdir(parents=True, exist_ok=True)
 
 
 def _publish(work: Path, output: Path) -> None:
     old = output.with_name(f".{output.name}.old")
     if output.is_dir():
         if any(output.iterdir()):
+            if old.is_dir():  # an earlier call ended while it removed what it had replaced
+                shutil.rmtree(old)
             os.replace(output, old)
         else:
             output.rmdir()

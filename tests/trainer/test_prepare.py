@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,9 +19,9 @@ import pytest
 from data.frames import FrameSet
 from data.patches import REFERENCE_AREA
 from data.shards.batch import Batches, Order
-from data.shards.cut import PrepareOptions, plan_shards
+from data.shards.cut import CUT_VERSION, PrepareOptions, plan_shards
 from data.shards.index import INDEX, Index
-from data.shards.prepare import prepare, prepare_cached
+from data.shards.prepare import cached_path, prepare, prepare_cached
 from data.shards.read import ShardReader
 from tests.data.small_sets import OPTIONS, write_set
 from trainer.cli import main
@@ -190,6 +191,36 @@ def test_existing_shards_are_replaced_only_with_force(frames, expected, tmp_path
     assert [p.name for p in tmp_path.iterdir()] == ["shards"]
 
 
+class Ended(BaseException):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("call", [1, 2])
+def test_an_end_while_replaced_shards_are_removed_does_not_disturb_the_next_force(
+    frames, expected, tmp_path, monkeypatch, call
+):
+    output = tmp_path / "shards"
+    prepare(frames, output, replace(OPTIONS, seed=7))
+    calls = []
+
+    def end(folder: Path) -> None:
+        calls.append(folder)
+        if len(calls) == call:
+            raise Ended
+        remove(folder)
+
+    remove = shutil.rmtree
+    with monkeypatch.context() as patched:
+        patched.setattr("data.shards.prepare.shutil.rmtree", end)
+        with pytest.raises(Ended):
+            prepare(frames, output, OPTIONS, force=True)
+    assert content(output) == expected
+    assert (tmp_path / ".shards.old" / INDEX).is_file()
+    prepare(frames, output, OPTIONS, force=True)
+    assert content(output) == expected
+    assert [p.name for p in tmp_path.iterdir()] == ["shards"]
+
+
 def test_a_folder_of_other_files_is_never_replaced(frames: Path, tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(ValueError, match="holds other files"):
@@ -301,6 +332,14 @@ def test_processes_that_want_the_same_cached_shards_make_them_once(frames, expec
     assert [p.name for p in root.parent.iterdir()] == [root.name]
     assert prepare_cached(frames, OPTIONS).root == root
     assert prepare_cached(frames, replace(OPTIONS, seed=3)).root != root
+
+
+def test_cached_shards_of_earlier_code_are_not_taken(frames, tmp_path, monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
+    before = cached_path(frames, OPTIONS)
+    assert cached_path(frames, OPTIONS) == before
+    monkeypatch.setattr("data.shards.prepare.CUT_VERSION", CUT_VERSION + 1)
+    assert cached_path(frames, OPTIONS) != before
 
 
 def test_the_index_holds_manifest_options_and_checksums(expected: dict[str, bytes], frames: Path):
