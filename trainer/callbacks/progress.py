@@ -117,8 +117,10 @@ class TrainingProgress(ProgressBar):
             self._line(f"trained {trainer.global_step} steps in {duration(time.monotonic() - self._started)}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Close the bar, so that the message stands below it."""
+        """Close the bar, so that the message stands below it; say how an interrupted run continues."""
         self._close()
+        if self._enabled and isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit":
+            self._line(f"interrupted at step {trainer.global_step}; continue with --ckpt_path last")
 
     def print(self, *args: Any, **kwargs: Any) -> None:
         """Print above the bar."""
