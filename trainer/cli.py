@@ -7,6 +7,7 @@ import difflib
 import importlib
 import importlib.util
 import os
+import re
 import sys
 
 from trainer.configs import UsageError
@@ -25,6 +26,25 @@ COMMANDS = {
     "models": "list denoisers and registered models",
     "upload": "send a run that was tracked locally to a tracking server",
 }
+
+# Failures of the surroundings (device, tracking store) that libraries report with classes of their own. They
+# are known by name, since importing the classes would make every command slow.
+FORESEEN = {
+    "lightning.fabric.utilities.exceptions.MisconfigurationException": "",
+    "mlflow.exceptions.MlflowException": "the tracking store",
+    "sqlalchemy.exc.SQLAlchemyError": "the tracking store",
+    "alembic.util.exc.CommandError": "the tracking store",
+    "torch.OutOfMemoryError": "",
+    "torch.distributed.DistNetworkError": "",
+}
+# PyTorch reports a missing or full device as a plain RuntimeError or AssertionError.
+DEVICE_FAILURE = re.compile(
+    r"not compiled with \w+ enabled|not linked with support for|No CUDA GPUs|no NVIDIA driver|invalid device "
+    r"ordinal|Invalid device string|device type at start of device string|can't allocate memory|CUDA driver "
+    r"version is insufficient|out of memory|no kernel image is available|devices are busy or unavailable",
+    re.IGNORECASE,
+)
+DATABASE_DETAIL = ("[SQL:", "[parameters:", "(Background on", "(raised as a result of")
 
 
 def usage() -> str:
@@ -68,11 +88,29 @@ def main() -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (ValueError, OSError) as error:
-        if os.environ.get("PENUMBRA_TRACEBACK"):
+    except Exception as error:
+        message = foreseen(error)
+        if message is None or os.environ.get("PENUMBRA_TRACEBACK"):
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {message}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
+
+
+def foreseen(error: Exception) -> str | None:
+    """Return what to print for an error that a user can mend, None for one that is a bug."""
+    if isinstance(error, (ValueError, OSError)):
+        return str(error)
+    lines = [line.strip() for line in str(error).splitlines()]
+    lines = [line for line in lines if line and not line.startswith(DATABASE_DETAIL)]
+    text = lines[0] if lines else type(error).__name__
+    names = {f"{cls.__module__}.{cls.__name__}" for cls in type(error).__mro__}
+    for name in FORESEEN.keys() & names:
+        if not FORESEEN[name]:
+            return text
+        return f"{FORESEEN[name]} (MLFLOW_TRACKING_URI, or runs/mlflow.db) cannot be used: {text}"
+    if isinstance(error, (RuntimeError, AssertionError)) and DEVICE_FAILURE.search(text):
+        return text
+    return None
 
 
 def _run(verb: str, arguments: list[str]) -> int:

@@ -99,5 +99,82 @@ def test_print_config_shows_defaults_file_and_overrides(monkeypatch, capsys):
         assert part in text, part
 
 
+def test_accelerator_that_is_absent_is_one_line_and_exit_1(monkeypatch, capsys, tmp_path):
+    import torch
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    code, printed = run(
+        monkeypatch, capsys, "fit", "--config", "wskp_bmfr.yaml", "--trainer.accelerator", "cuda"
+    )
+    assert code == 1
+    assert printed.err.startswith("error: ")
+    assert printed.err.count("\n") == 1
+    assert "CUDAAccelerator" in printed.err
+
+
+def test_unusable_tracking_uri_is_one_line_that_names_it_and_exit_1(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "foo://x")
+    code, printed = run(monkeypatch, capsys, "models")
+    assert code == 1
+    assert printed.err.startswith("error: cannot read the model store foo://x: ")
+    assert printed.err.count("\n") == 1
+
+
+def failing(monkeypatch, error):
+    def fail(verb, arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "_run", fail)
+
+
+def database_error():
+    from mlflow.exceptions import MlflowException
+
+    return MlflowException(
+        "(raised as a result of Query-invoked autoflush; consider …)\n"
+        "(sqlite3.OperationalError) attempt to write a readonly database\n[SQL: INSERT INTO runs …]"
+    )
+
+
+def device_error():
+    return RuntimeError("CUDA error: invalid device ordinal\nCUDA kernel errors might be reported later")
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (database_error, "attempt to write a readonly database"),
+        (device_error, "CUDA error: invalid device ordinal"),
+        (lambda: AssertionError("Torch not compiled with CUDA enabled"), "not compiled with CUDA"),
+    ],
+)
+def test_failures_of_store_and_device_are_one_line_and_exit_1(monkeypatch, capsys, make, text):
+    failing(monkeypatch, make())
+    code, printed = run(monkeypatch, capsys, "fit")
+    assert code == 1
+    assert printed.err.startswith("error: ")
+    assert text in printed.err
+    assert printed.err.count("\n") == 1
+
+
+def test_traceback_of_a_foreseen_failure_is_shown_on_demand(monkeypatch, capsys):
+    monkeypatch.setenv("PENUMBRA_TRACEBACK", "1")
+    failing(monkeypatch, device_error())
+    with pytest.raises(RuntimeError, match="invalid device ordinal"):
+        run(monkeypatch, capsys, "fit")
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("shapes differ"), AssertionError(), KeyError("x"), TypeError("x")]
+)
+def test_errors_that_are_bugs_keep_their_traceback(monkeypatch, capsys, error):
+    failing(monkeypatch, error)
+    with pytest.raises(type(error)):
+        run(monkeypatch, capsys, "fit")
+
+
 def test_messages_without_a_near_name_are_left_whole():
     assert explain("something else is wrong", {"model"}) == "something else is wrong"

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mlflow.tracking import MlflowClient
 
 HELP = "list denoisers and registered models"
 
@@ -86,31 +89,48 @@ def registered_table(store: str) -> Any:
     """
     from rich.table import Table
 
-    from trainer.tracking import open_client
-
-    client = open_client(store)
-    from mlflow.exceptions import MlflowException
-
     table = Table(title=f"Registered models in {store}", title_justify="left")
     for title in ("URI", "aliases", "run", "created"):
         table.add_column(title, overflow="fold")
+    for row in registered_rows(store):
+        table.add_row(*row)
+    return table
+
+
+def registered_rows(store: str) -> list[tuple[str, str, str, str]]:
+    """Return URI, aliases, run and date of every registered model version of a store.
+
+    Raises:
+        ValueError: The store cannot be read.
+    """
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from trainer.tracking import open_client
+
     try:
-        registered = client.search_registered_models()
-    except (MlflowException, OSError) as error:
-        raise ValueError(f"cannot read the model store {store}: {str(error).splitlines()[0]}") from error
-    for model in sorted(registered, key=lambda m: m.name):
+        return _rows(open_client(store))
+    except (MlflowException, SQLAlchemyError, OSError) as error:
+        first = (str(error).splitlines() or [repr(error)])[0].strip()
+        raise ValueError(f"cannot read the model store {store}: {first}") from error
+
+
+def _rows(client: MlflowClient) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for model in sorted(client.search_registered_models(), key=lambda m: m.name):
         aliases: dict[str, list[str]] = {}
         for alias, version in client.get_registered_model(model.name).aliases.items():
             aliases.setdefault(str(version), []).append(f"@{alias}")
         versions = client.search_model_versions(f"name = '{model.name}'")
         for version in sorted(versions, key=lambda v: int(v.version)):
-            table.add_row(
+            row = (
                 f"models:/{model.name}/{version.version}",
                 " ".join(aliases.get(str(version.version), [])),
                 version.run_id or "",
                 _date(version.creation_timestamp),
             )
-    return table
+            rows.append(row)
+    return rows
 
 
 def _date(milliseconds: int | None) -> str:
