@@ -48,20 +48,26 @@ def is_server(uri: str) -> bool:
 
 
 def unreachable(uri: str, timeout_s: float = 5.0) -> str | None:
-    """Return why a tracking server cannot be used, None if it answers."""
+    """Return why a tracking server cannot be used, None if it answers.
+
+    Connection errors, timeouts and statuses from 500 count; a request that is refused does not.
+    """
     import requests
 
     try:
         answer = requests.get(f"{uri.rstrip('/')}/health", timeout=timeout_s)
     except requests.RequestException as error:
         return type(error).__name__
-    return None if answer.ok else f"HTTP status {answer.status_code}"
+    # A proxy may hide or protect the path (401, 403, 404): it answers, so the server is there.
+    return f"HTTP status {answer.status_code}" if answer.status_code >= 500 else None
 
 
 def quiet_mlflow() -> None:
     """Keep MLflow's set-up messages off the terminal and its retries short."""
     for name in ("mlflow", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    # It logs every database error with its traceback, and raises it as well.
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
     # Seven retries with doubling waits would stop training for minutes when a server goes away.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")

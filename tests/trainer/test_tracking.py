@@ -3,14 +3,16 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
 from trainer.commands import upload
 from trainer.runs import RunRecord
-from trainer.tracking import MLflowTracking, open_client, tracking_uri
+from trainer.tracking import MLflowTracking, open_client, tracking_uri, unreachable
 
 
 @pytest.fixture(autouse=True)
@@ -116,6 +118,38 @@ def test_upload_to_an_unreachable_server_fails_and_changes_nothing():
     with pytest.raises(ValueError, match=r"cannot be reached .* nothing was sent"):
         upload.run(arguments(logger.folder, to=f"http://127.0.0.1:{free_port()}"))
     assert (logger.folder / "run.json").read_text() == before
+
+
+@pytest.fixture
+def proxy():
+    """A server on loopback that answers every request with one status; its URI, and the status to set."""
+    answers = {"status": 200}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(answers["status"])
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def log_message(self, format, *args):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as http:
+        thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        yield f"http://127.0.0.1:{http.server_port}", answers
+        http.shutdown()
+        thread.join()
+
+
+def test_server_behind_a_proxy_that_guards_or_hides_the_health_path_counts_as_reachable(proxy):
+    uri, answers = proxy
+    for status in (200, 401, 403, 404):
+        answers["status"] = status
+        assert unreachable(uri) is None, status
+    for status in (500, 502, 503):
+        answers["status"] = status
+        assert unreachable(uri) == f"HTTP status {status}"
 
 
 def test_upload_without_a_server_asks_for_one():
