@@ -15,16 +15,22 @@ import json
 import multiprocessing
 import os
 import shutil
-import threading
+import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 
 from data.frames import FrameSet
 from data.shards.cut import CUT_VERSION, PrepareOptions, ShardPlan, make_scene, plan_shards
+from data.shards.estimate import announcement, check_room, estimate
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
+from data.shards.processes import in_processes
+
+MANY_FRAMES = 50
+"""Above so many frames the cache is filled by several processes, whose start then is worth it."""
+
+MOST_PROCESSES = 8
+"""Processes that fill the cache, at most; `trainer prepare` takes any number."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of samples that are done and their total."""
@@ -92,13 +98,29 @@ def cache_folder() -> Path:
 def prepare_cached(root: Path, options: PrepareOptions, progress: Progress | None = None) -> Index:
     """Return shards of an ingested data set from the cache, made now if they are not there.
 
-    They are keyed by manifest and options. Several processes may call this at the same time.
+    They are keyed by manifest, options and the version of cutting. Several processes may call this at the
+    same time. Says on standard error how much will be made, and where.
+
+    Raises:
+        ValueError: The frames cannot be cut.
+        OSError: The disk has no room, or a file cannot be read or written.
     """
     output = cached_path(root, options)
     if (output / INDEX).is_file():
         return Index.read(output)
     output.parent.mkdir(parents=True, exist_ok=True)
-    return prepare(root, output, options, wait_for_others=True, progress=progress)
+    frames = FrameSet(root)
+    expected = estimate(frames, options)
+    print(announcement(root, output, expected), file=sys.stderr, flush=True)
+    check_room(root, output, expected)
+    processes = _cache_processes(sum(len(frames.frames(scene)) for scene in frames.scenes()))
+    return prepare(root, output, options, processes=processes, wait_for_others=True, progress=progress)
+
+
+def _cache_processes(frames: int) -> int:
+    if frames <= MANY_FRAMES or multiprocessing.current_process().daemon:  # which may not start others
+        return 1
+    return min(os.cpu_count() or 1, MOST_PROCESSES)
 
 
 def cached_path(root: Path, options: PrepareOptions) -> Path:
@@ -132,40 +154,11 @@ def _make_all(
     report()
     jobs = [(str(frames.root), scene, group, options, str(work)) for scene, group in missing.items()]
     if processes > 1 and len(jobs) > 1:
-        _in_processes(jobs, min(processes, len(jobs)), report)
+        in_processes(make_scene, jobs, min(processes, len(jobs)), report)
     else:
         for job in jobs:
             make_scene(*job, report=report)
     return [_record(work, plan.file) for plan in plans]
-
-
-def _in_processes(jobs: list[tuple[Any, ...]], processes: int, report: Callable[[], None]) -> None:
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=_end_with_parent) as pool:
-        futures = [pool.submit(make_scene, *job) for job in jobs]
-        try:
-            pending = set(futures)
-            while pending:
-                finished, pending = wait(pending, timeout=0.5, return_when=FIRST_EXCEPTION)
-                for future in finished:
-                    future.result()
-                report()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-
-
-def _end_with_parent() -> None:
-    """End this worker when the process that started it is gone, however that happened."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch(sentinel: int) -> None:
-        wait_for([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
 def _record(work: Path, file: str) -> ShardRecord:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -20,6 +21,7 @@ from data.frames import FrameSet
 from data.patches import REFERENCE_AREA
 from data.shards.batch import Batches, Order
 from data.shards.cut import CUT_VERSION, PrepareOptions, plan_shards
+from data.shards.estimate import estimate
 from data.shards.index import INDEX, Index
 from data.shards.prepare import cached_path, prepare, prepare_cached
 from data.shards.read import ShardReader
@@ -142,9 +144,9 @@ def test_workers_end_with_the_process_that_started_them(frames: Path, tmp_path: 
         "import os, sys, time\n"
         "from concurrent.futures import ProcessPoolExecutor\n"
         "from multiprocessing import get_context\n"
-        "from data.shards.prepare import _end_with_parent\n"
+        "from data.shards.processes import end_with_parent\n"
         "if __name__ == '__main__':\n"
-        "    pool = ProcessPoolExecutor(1, get_context('spawn'), _end_with_parent)\n"
+        "    pool = ProcessPoolExecutor(1, get_context('spawn'), end_with_parent)\n"
         "    print(pool.submit(os.getpid).result(), flush=True)\n"
         "    os.kill(os.getpid(), 9)\n"
     )
@@ -332,6 +334,75 @@ def test_processes_that_want_the_same_cached_shards_make_them_once(frames, expec
     assert [p.name for p in root.parent.iterdir()] == [root.name]
     assert prepare_cached(frames, OPTIONS).root == root
     assert prepare_cached(frames, replace(OPTIONS, seed=3)).root != root
+
+
+def test_the_estimate_is_close_to_what_is_made(frames, expected):
+    found = estimate(FrameSet(frames), OPTIONS)
+    shards = json.loads(expected[INDEX])["shards"]
+    assert found.frames == sum(len(s["samples"]) for s in shards if s["split"] == "test")
+    assert found.patches == sum(len(s["samples"]) for s in shards if s["split"] != "test")
+    assert found.bytes == pytest.approx(sum(s["bytes"] for s in shards), rel=0.05)
+
+
+def test_filling_the_cache_says_size_place_and_how_to_choose_it(frames, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
+    found = estimate(FrameSet(frames), OPTIONS)
+    root = prepare_cached(frames, OPTIONS).root
+    assert capsys.readouterr().err.splitlines() == [
+        f"preparing frames: {found.patches} patches and {found.frames} whole frames, about 1 MB, in {root}; "
+        f"to choose the place: trainer prepare {frames} --output DIR --processes N, then --data.root DIR"
+    ]
+    prepare_cached(frames, OPTIONS)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_disk_without_room_is_told_before_anything_is_made(frames, tmp_path, monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
+    usage = types.SimpleNamespace(free=400_000)
+    monkeypatch.setattr("data.shards.estimate.shutil.disk_usage", lambda folder: usage)
+    with pytest.raises(OSError, match=r"take about 1 MB, and 0 MB are free; make room, set PENUMBRA_CACHE"):
+        prepare_cached(frames, OPTIONS)
+    assert list((tmp_path / "shards").iterdir()) == []
+    begun = tmp_path / "shards" / f"{cached_path(frames, OPTIONS).name}.partial" / "shards"
+    begun.mkdir(parents=True)
+    (begun / "train-00000.tar").write_bytes(bytes(10**6))  # what is there already needs no room
+    assert prepare_cached(frames, OPTIONS).count("test") == 4
+
+
+@pytest.mark.parametrize(("count", "cores", "processes"), [(50, 4, 1), (51, 4, 4), (51, 64, 8)])
+def test_many_frames_are_cached_by_several_processes(frames, tmp_path, monkeypatch, count, cores, processes):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path))
+    monkeypatch.setattr("data.shards.prepare.os.cpu_count", lambda: cores)
+    monkeypatch.setattr("data.shards.prepare.MANY_FRAMES", 12 + 50 - count)  # the set has 12
+    used = []
+    monkeypatch.setattr("data.shards.prepare.prepare", lambda *a, processes, **k: used.append(processes))
+    prepare_cached(frames, OPTIONS)
+    assert used == [processes]
+
+
+def test_a_script_without_a_main_guard_fills_the_cache_by_several_processes(frames, expected, tmp_path):
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nimport data.shards.prepare as module\n"
+        "from tests.data.small_sets import OPTIONS\nmodule.MANY_FRAMES = 1\n"
+        "module.os.cpu_count = lambda: 2\n"
+        "print(module.prepare_cached(Path(sys.argv[1]), OPTIONS).root)\n"
+    )
+    environment = {
+        **os.environ,
+        "PENUMBRA_CACHE": str(tmp_path),
+        "PYTHONPATH": str(Path(__file__).parents[2]),
+    }
+    made = subprocess.run(
+        [sys.executable, script, frames],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
+        timeout=60,
+    )
+    assert content(Path(made.stdout.strip())) == expected
+    assert made.stderr.count("preparing frames") == 1
 
 
 def test_cached_shards_of_earlier_code_are_not_taken(frames, tmp_path, monkeypatch):
