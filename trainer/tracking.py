@@ -136,21 +136,44 @@ class MLflowTracking(Logger):
         return self.experiment_name
 
     @property
-    def version(self) -> str:
-        """Name of the run."""
-        return self.folder.name
+    def version(self) -> str | None:
+        """Name of the run; None on other ranks until `share_folder`."""
+        return self.folder.name if self._has_folder() else None
 
     @property
-    def save_dir(self) -> str:
-        """Folder of the run."""
-        return str(self.folder)
+    def save_dir(self) -> str | None:
+        """Folder of the run; None on other ranks until `share_folder`."""
+        return str(self.folder) if self._has_folder() else None
 
     @property
     def folder(self) -> Path:
-        """Folder of the run, created on first use; to be used on the first rank only."""
+        """Folder of the run, created on first use by the first rank.
+
+        Raises:
+            RuntimeError: Another rank asks before `share_folder` was called.
+        """
         if self._folder is None:
+            if not self._has_folder():
+                raise RuntimeError(
+                    "only the first rank knows the run's folder; call share_folder on all ranks"
+                )
             self._folder = self.resume_from or new_folder(self.root, self.experiment_name)
         return self._folder
+
+    def share_folder(self, broadcast: Callable[[str], str]) -> Path:
+        """Let every rank know the folder that the first one created; to be called on all ranks.
+
+        Args:
+            broadcast: Sends the first rank's text to all, as `trainer.strategy.broadcast` does.
+        """
+        shared = broadcast(str(self.folder.resolve()) if _first_rank() else "")
+        if not _first_rank():
+            self._folder = Path(shared)
+        return Path(shared)
+
+    def _has_folder(self) -> bool:
+        # A folder that another rank creates would be an empty run beside the real one.
+        return _first_rank() or self._folder is not None
 
     @property
     def record(self) -> RunRecord:
@@ -316,6 +339,10 @@ class MLflowTracking(Logger):
             self.run_id, sampling_interval=10, resume_logging=resumed, tracking_uri=self.uri
         )
         self._monitor.start()
+
+
+def _first_rank() -> bool:
+    return getattr(rank_zero_only, "rank", 0) == 0  # Lightning sets the attribute on its function
 
 
 def _log_params(params: Sequence[Any], client: MlflowClient, run: str) -> None:

@@ -1,8 +1,10 @@
 import os
+from types import SimpleNamespace
 
 import pytest
 import torch
 from lightning.pytorch import Trainer
+from lightning.pytorch.utilities import rank_zero_only
 
 from models import WSKP
 from tests.synthetic import Synthetic, patch
@@ -10,6 +12,7 @@ from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint
 from trainer.callbacks.progress import TrainingProgress, duration
 from trainer.callbacks.recorder import flatten, git_state, installed
 from trainer.modules import Regression
+from trainer.tracking import MLflowTracking
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers"),
@@ -45,6 +48,48 @@ def test_full_disk_is_an_error_that_names_the_checkpoint(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"cannot write checkpoint .*last\.ckpt"):
         AtomicCheckpointIO().save_checkpoint({"w": torch.zeros(1 << 16)}, tmp_path / "last.ckpt")
     assert os.listdir(tmp_path) == []
+
+
+def second_rank(monkeypatch, first):
+    """A trainer as the second of two processes sees it, with the folder of `first` arriving by broadcast."""
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    logger = MLflowTracking("exp", system_metrics=False)
+    strategy = SimpleNamespace(broadcast=lambda own: own or str(first.folder.resolve()))
+    return SimpleNamespace(
+        logger=logger, loggers=[logger], strategy=strategy, is_global_zero=False, global_rank=1,
+        global_step=5, default_root_dir=".",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def first_rank(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    logger = MLflowTracking("exp", system_metrics=False)
+    assert logger.folder.is_dir()
+    return logger
+
+
+def test_other_ranks_save_into_the_first_ranks_folder_and_create_none(first_rank, monkeypatch):
+    folder = first_rank.folder
+    trainer = second_rank(monkeypatch, first_rank)
+    assert trainer.logger.save_dir is None
+    assert trainer.logger.version is None
+    callback = LastCheckpoint()
+    callback.setup(trainer, None, "fit")
+    assert callback.dirpath == str(folder.resolve() / "checkpoints")
+    assert trainer.logger.save_dir == str(folder.resolve())
+    assert list(folder.parent.iterdir()) == [folder]
+
+
+def test_batch_of_another_rank_is_saved_in_the_first_ranks_folder(first_rank, monkeypatch):
+    folder = first_rank.folder
+    trainer = second_rank(monkeypatch, first_rank)
+    guard = FiniteGuard()
+    guard.setup(trainer, None, "fit")
+    with pytest.raises(ValueError, match="the loss became nan at step 5"):
+        guard.on_train_batch_end(trainer, None, torch.tensor(float("nan")), {"color": torch.ones(1)}, 0)
+    assert [path.name for path in folder.iterdir()] == ["nonfinite-step5-rank1.pt"]
+    assert list(folder.parent.iterdir()) == [folder]
 
 
 class _Poisoned(Synthetic):

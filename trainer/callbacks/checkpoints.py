@@ -43,9 +43,9 @@ class _RunCheckpoint(ModelCheckpoint):
     """A checkpoint callback that writes into the run's folder."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Choose the folder on the first rank; the base class tells the others."""
-        if self.dirpath is None and trainer.is_global_zero and isinstance(trainer.logger, MLflowTracking):
-            self.dirpath = str(trainer.logger.folder.resolve() / "checkpoints")
+        """Take the first rank's run folder on every rank."""
+        if self.dirpath is None and isinstance(trainer.logger, MLflowTracking):
+            self.dirpath = str(trainer.logger.share_folder(trainer.strategy.broadcast) / "checkpoints")
         super().setup(trainer, pl_module, stage)
 
 

@@ -14,6 +14,11 @@ from trainer.tracking import MLflowTracking
 class FiniteGuard(Callback):
     """Raise when the loss of a step is NaN or infinite; save the batch beside the run."""
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Learn the run's folder while all ranks still work together."""
+        if stage == "fit" and isinstance(trainer.logger, MLflowTracking):
+            trainer.logger.share_folder(trainer.strategy.broadcast)
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
@@ -25,7 +30,7 @@ class FiniteGuard(Callback):
         loss = outputs["loss"] if isinstance(outputs, dict) else outputs
         if loss is None or bool(torch.isfinite(loss).all()):
             return
-        folder = Path(trainer.logger.save_dir) if isinstance(trainer.logger, MLflowTracking) else Path()
+        folder = trainer.logger.folder if isinstance(trainer.logger, MLflowTracking) else Path()
         path = folder / f"nonfinite-step{trainer.global_step}-rank{trainer.global_rank}.pt"
         tensors = {k: v for k, v in batch.items() if isinstance(v, torch.Tensor)}
         torch.save({**batch, **{k: v.cpu() for k, v in tensors.items()}}, path)
