@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -239,6 +241,47 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     client.set_registered_model_alias("tiny", "champion", "1")
     client.set_terminated(run)
     return uri, run
+
+
+def test_registering_is_quiet_but_lets_other_messages_pass(
+    store: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mlflow.onnx
+    from mlflow.tracking import MlflowClient
+
+    uri, run = store
+    export(net(), tmp_path / "calm.onnx")
+    log = mlflow.onnx.log_model
+
+    def talkative(*arguments: Any, **options: Any) -> Any:
+        info = log(*arguments, **options)
+        logging.getLogger("mlflow.onnx").warning("a real warning")
+        print("Successfully", "finished", file=sys.stderr)
+        print("no end of line", end="", file=sys.stderr)
+        return info
+
+    capfd.readouterr()
+    monkeypatch.setattr(mlflow.onnx, "log_model", talkative)
+    for version in ("1", "2"):
+        assert log_and_register(run, tmp_path / "calm.onnx", "calm", uri) == version
+        printed = capfd.readouterr()
+        assert printed.out == ""
+        first, *rest = printed.err.splitlines()
+        assert first.endswith("a real warning")
+        assert rest == ["Successfully finished", "no end of line"]
+    MlflowClient(uri, uri).delete_registered_model("calm")
+
+
+def test_messages_of_onnx_runtime_are_back_after_registering(
+    store: tuple[str, str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    import onnxruntime
+
+    assert store
+    export(net(), tmp_path / "net.onnx")
+    capfd.readouterr()
+    onnxruntime.InferenceSession(tmp_path / "net.onnx", providers=["CPUExecutionProvider"])
+    assert "Initializer exposure appears in graph inputs" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("model", ["models:/tiny/1", "models:/tiny@champion", "runs:/RUN/export/tiny.onnx"])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
+import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import onnx
@@ -46,7 +49,7 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
 
     quiet_mlflow()
     artifact = load_artifact(onnx_path)
-    with using_store(tracking_uri), warnings.catch_warnings():
+    with using_store(tracking_uri), _quiet(), warnings.catch_warnings():
         # MLflow's own classes, at the first import of mlflow.pyfunc.
         warnings.filterwarnings("ignore", ".*Any type hint is inferred as AnyType", UserWarning)
         info = mlflow.onnx.log_model(
@@ -61,6 +64,61 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
             model_id=_logged_model(run_id, name),
         )
     return str(info.registered_model_version)
+
+
+_REGISTERED = re.compile(
+    r"(Successfully registered model|Registered model '.*' already exists|Created version '.*' of model).*",
+    re.DOTALL,
+)
+"""What MLflow prints about a registration; the caller says it in its own words."""
+
+_ORT_WARNING, _ORT_ERROR = 2, 3
+"""Severities of ONNX Runtime: the one it starts with, and the next, which leaves its warnings out."""
+
+
+class _Sieve:
+    """A stream without the lines that tell of a registration, which `print` writes in two parts."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._dropped = False
+
+    def write(self, text: str) -> int:
+        """Pass text on unless it tells of a registration, or ends the line of one that did."""
+        drop = _REGISTERED.fullmatch(text) is not None or (self._dropped and text == "\n")
+        self._dropped = drop and not text.endswith("\n")
+        return len(text) if drop else self._stream.write(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _not_providers(record: logging.LogRecord) -> bool:
+    return "declares execution providers" not in str(record.msg)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Leave out what MLflow and ONNX Runtime say about every registration; other messages and errors pass.
+
+    MLflow opens the logged model once to try its example. It then misses a GPU that nobody asked for, and
+    ONNX Runtime warns that inputs with a default, the frame numbers, are no constants.
+    """
+    import onnxruntime
+
+    logger = logging.getLogger("mlflow.onnx")
+    logger.addFilter(_not_providers)
+    onnxruntime.set_default_logger_severity(_ORT_ERROR)
+    try:
+        with redirect_stderr(_Sieve(sys.stderr)):
+            yield
+    finally:
+        onnxruntime.set_default_logger_severity(_ORT_WARNING)
+        logger.removeFilter(_not_providers)
 
 
 @contextmanager
