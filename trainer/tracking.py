@@ -106,6 +106,7 @@ class MLflowTracking(Logger):
         root: Folder of all runs.
         system_metrics: Record load and memory of the machine every ten seconds.
         resume_from: Run folder to continue; set by the command when a checkpoint of it is given.
+        evaluation: Only add scores to the continued run and leave its status; set by the command.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class MLflowTracking(Logger):
         root: str = "runs",
         system_metrics: bool = True,
         resume_from: str | None = None,
+        evaluation: bool = False,
     ) -> None:
         super().__init__()
         self.experiment_name = experiment
@@ -124,6 +126,8 @@ class MLflowTracking(Logger):
         self.root = Path(root)
         self.system_metrics = system_metrics
         self.resume_from = Path(resume_from) if resume_from else None
+        self._keeps_status = False
+        self.evaluation = evaluation
         self._folder: Path | None = None
         self._record: RunRecord | None = None
         self._client: MlflowClient | None = None
@@ -263,12 +267,17 @@ class MLflowTracking(Logger):
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """End the run: `success` or `finished` → FINISHED, anything else → FAILED."""
+        """End the run: `success` or `finished` → FINISHED, anything else → FAILED.
+
+        A run that was continued for evaluation keeps its status, which is that of its training.
+        """
         if self._client is None:
             return
         if self._monitor is not None:
             self._monitor.finish()
             self._monitor = None
+        if self._keeps_status:
+            return
         word = "FINISHED" if status in ("success", "finished") else "FAILED"
         self.call(lambda client, run: client.set_terminated(run, word))
 
@@ -292,13 +301,17 @@ class MLflowTracking(Logger):
 
         assert self._record is not None
         try:
-            client.set_terminated(self._record.run_id or "", "RUNNING")
+            if self.evaluation:
+                client.get_run(self._record.run_id or "")
+            else:
+                client.set_terminated(self._record.run_id or "", "RUNNING")
         except MlflowException:
             print(
                 f"The run {self._record.name} is no longer in its store; a new one takes its place.",
                 file=sys.stderr,
             )
             return False
+        self._keeps_status = self.evaluation
         return True
 
     def _create(self, uri: str, unreached_uri: str | None = None, server_run_id: str | None = None) -> None:
@@ -314,6 +327,7 @@ class MLflowTracking(Logger):
         )
         record.save(self.folder)
         self._record = record
+        self._keeps_status = False
         self._start_monitor(resumed=False)
 
     def _fall_back(self, server: str, reason: str, server_run: str | None) -> None:

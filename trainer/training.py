@@ -160,6 +160,7 @@ class TrainingCLI(LightningCLI):
             folder = runs.folder_of_checkpoint(Path(config.ckpt_path))
             if tracked and folder is not None:
                 logger.init_args.resume_from = str(folder)
+                logger.init_args.evaluation = self.config.subcommand != "fit"
             elif self.config.subcommand != "fit":
                 config.trainer.logger = False
         if self.config.subcommand != "fit":

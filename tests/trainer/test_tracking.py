@@ -98,6 +98,33 @@ def test_resumed_logger_continues_the_same_run_and_keeps_its_parameters():
     assert [m.step for m in open_client(first.uri).get_metric_history(first.run_id, "loss")] == [1, 2]
 
 
+@pytest.mark.parametrize("end", ["success", "failed"])
+@pytest.mark.parametrize("status", ["FINISHED", "FAILED"])
+def test_evaluation_adds_scores_and_keeps_the_status_of_the_training(status, end):
+    training = MLflowTracking("exp", system_metrics=False)
+    training.log_metrics({"loss": 2.0}, step=1)
+    training.finalize("success" if status == "FINISHED" else "failed")
+    before = open_client(training.uri).get_run(training.run_id).info
+    test = MLflowTracking("exp", system_metrics=False, resume_from=str(training.folder), evaluation=True)
+    test.log_metrics({"test/psnr": 30.0}, step=1)
+    test.finalize(end)
+    run = open_client(training.uri).get_run(training.run_id)
+    assert run.data.metrics["test/psnr"] == 30.0
+    assert (run.info.status, run.info.end_time) == (status, before.end_time)
+
+
+def test_evaluation_whose_run_is_gone_ends_the_new_run_with_its_own_status(capsys):
+    training = MLflowTracking("exp", system_metrics=False)
+    record = training.record
+    record.run_id = "0" * 32
+    record.save(training.folder)
+    test = MLflowTracking("exp", system_metrics=False, resume_from=str(training.folder), evaluation=True)
+    test.log_metrics({"test/psnr": 30.0}, step=1)
+    test.finalize("failed")
+    assert "is no longer in its store" in capsys.readouterr().err
+    assert open_client(test.uri).get_run(test.run_id).info.status == "FAILED"
+
+
 def test_unreachable_server_falls_back_to_the_local_store_and_says_so_once(capsys):
     uri = f"http://127.0.0.1:{free_port()}"
     logger = MLflowTracking("exp", tracking_uri=uri, system_metrics=False)
