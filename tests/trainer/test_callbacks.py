@@ -1,18 +1,20 @@
 import os
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from jsonargparse import Namespace
 from lightning.pytorch import Trainer
 from lightning.pytorch.utilities import rank_zero_only
 
 from models import WSKP
 from tests.synthetic import Synthetic, patch
-from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint
+from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint, recorder
 from trainer.callbacks.progress import TrainingProgress, duration
-from trainer.callbacks.recorder import flatten, git_state, installed
+from trainer.callbacks.recorder import RunRecorder, flatten, git_state, installed
 from trainer.modules import Regression
-from trainer.tracking import MLflowTracking
+from trainer.tracking import MLflowTracking, open_client
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers"),
@@ -136,6 +138,24 @@ def test_durations_read_as_people_say_them():
 def test_flattened_configuration_has_dotted_names_and_no_empty_values():
     tree = {"a": {"b": 1, "c": None}, "list": [{"class_path": "x.Y"}, {"class_path": "z.W"}], "config": ["f"]}
     assert flatten(tree) == {"a.b": 1, "list": "x.Y, z.W"}
+
+
+def test_resumed_configurations_lie_beside_the_first_in_folder_and_run(first_rank, monkeypatch):
+    monkeypatch.setattr(recorder, "installed", lambda: ["penumbra==1"])
+    module = Regression(WSKP(layers=3))
+    for number in range(3):
+        logger = first_rank if number == 0 else MLflowTracking("exp", resume_from=str(first_rank.folder))
+        logger.system_metrics = False
+        parser = SimpleNamespace(dump=lambda config, skip_none: str(config))
+        config = Namespace(seed=number)
+        trainer = SimpleNamespace(logger=logger, datamodule=Synthetic())
+        RunRecorder(parser, config, save_to_log_dir=False).save_config(trainer, module, "fit")
+    names = ("config.yaml", "config-resumed-1.yaml", "config-resumed-2.yaml")
+    texts = [str(Namespace(seed=number)) for number in range(3)]
+    assert [(first_rank.folder / name).read_text() for name in names] == texts
+    client = open_client(first_rank.uri)
+    stored = [client.download_artifacts(first_rank.run_id, name) for name in names]
+    assert [Path(path).read_text() for path in stored] == texts
 
 
 def test_record_of_the_environment_lists_what_is_installed_and_the_commit(tmp_path):

@@ -27,10 +27,9 @@ class RunRecorder(SaveConfigCallback):
         if stage != "fit" or not isinstance(logger, MLflowTracking):
             return
         text = self.parser.dump(self.config, skip_none=False)
-        path = logger.folder / "config.yaml"
-        if not path.exists() or self.overwrite:
-            path.write_text(text)
-        logger.log_text(text, "config.yaml")
+        name = config_name(logger.folder)
+        (logger.folder / name).write_text(text)
+        logger.log_text(text, name)
         logger.log_params(flatten(self.config.as_dict()))
         logger.log_text("\n".join(installed()) + "\n", "packages.txt")
         manifest_hash = getattr(trainer.datamodule, "manifest_hash", None)  # type: ignore[attr-defined]
@@ -39,6 +38,19 @@ class RunRecorder(SaveConfigCallback):
         tags |= {"data.manifest_hash": str(manifest_hash), "python": platform.python_version()}
         tags["parameters"] = str(sum(p.numel() for p in pl_module.parameters() if p.requires_grad))
         logger.set_tags(tags)
+
+
+def config_name(folder: Path) -> str:
+    """Return the file for a configuration: `config.yaml`, or `config-resumed-<n>.yaml` for a continued run.
+
+    The first configuration and those of earlier continuations stay as they are.
+    """
+    if not (folder / "config.yaml").exists():
+        return "config.yaml"
+    number = 1
+    while (folder / f"config-resumed-{number}.yaml").exists():
+        number += 1
+    return f"config-resumed-{number}.yaml"
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
