@@ -34,6 +34,10 @@ RUNS = Path("runs")
 def local_store(root: Path) -> str:
     """Return the URI of the local store below `root`, creating the folder."""
     root.mkdir(parents=True, exist_ok=True)
+    database = root / "mlflow.db"
+    if not os.access(database if database.exists() else root, os.W_OK):
+        # MLflow would try again for minutes.
+        raise PermissionError(f"the local tracking store {database} cannot be written")
     return f"sqlite:///{(root / 'mlflow.db').resolve()}"
 
 
@@ -93,7 +97,9 @@ def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
     location = None
     if uri.startswith("sqlite:///"):
         location = (Path(uri.removeprefix("sqlite:///")).parent / "artifacts" / name).as_uri()
-    return str(client.create_experiment(name, artifact_location=location))
+    # The kind chooses what the experiment's page shows; without it MLflow takes us for a language model.
+    tags = {"mlflow.experimentKind": "custom_model_development"}
+    return str(client.create_experiment(name, artifact_location=location, tags=tags))
 
 
 class MLflowTracking(Logger):

@@ -78,7 +78,11 @@ def class_arguments() -> set[str]:
 
     classes: list[Any] = [data.Shards, MLflowTracking]
     for module in (models, trainer.callbacks, trainer.losses, trainer.modules):
-        classes += [value for _, value in inspect.getmembers(module, inspect.isclass)]
+        classes += [
+            value
+            for _, value in inspect.getmembers(module, inspect.isclass)
+            if value.__module__.split(".")[0] in ("models", "trainer")  # torch.Tensor has no signature
+        ]
     return {name for cls in classes for name in inspect.signature(cls).parameters}
 
 

@@ -38,9 +38,11 @@ class ExportBest(Callback):
         if chosen is None:
             return
         logger.log_file(chosen, "checkpoints")
+        from mlflow.exceptions import MlflowException
+
         try:
             self._export(logger, chosen)
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, MlflowException) as error:
             logger.set_tags({"export.error": str(error)[:500]})
             print(
                 f"The export failed: {error}\nThe checkpoint is {chosen}; repeat with "
