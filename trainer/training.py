@@ -91,7 +91,7 @@ def explain(message: str, known: Iterable[str]) -> str:
     lines = [line.strip(" -\n") for line in message.splitlines() if line.strip()]
     text = " ".join(dict.fromkeys(lines))
     wrong = re.search(
-        r"(?:Unrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text
+        r"(?:[Uu]nrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text
     )
     if wrong is None:
         return text
