@@ -97,7 +97,9 @@ def explain(message: str, known: Iterable[str]) -> str:
         return text
     word = wrong.group(1)
     known = sorted(set(known))
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    groups = sorted({name.split(".")[0] for name in known if "." in name})
+    near = difflib.get_close_matches(word, groups, n=1) if "." not in word else []
+    near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     if not near:
         leaf = difflib.get_close_matches(word.rsplit(".", 1)[-1], known, n=1, cutoff=0.6)
         near = [f"{word.rpartition('.')[0]}.{leaf[0]}".lstrip(".")] if leaf else []
