@@ -20,6 +20,7 @@ from trainer import configs, runs
 from trainer.callbacks.recorder import RunRecorder
 
 TRACKING = "trainer.tracking.MLflowTracking"
+TOP_LEVEL = ("model", "data", "trainer", "config", "print_config", "ckpt_path", "seed_everything")
 
 
 def run_training(verb: str, arguments: list[str]) -> int:
@@ -97,8 +98,7 @@ def explain(message: str, known: Iterable[str]) -> str:
         return text
     word = wrong.group(1)
     known = sorted(set(known))
-    groups = sorted({name.split(".")[0] for name in known if "." in name})
-    near = difflib.get_close_matches(word, groups, n=1) if "." not in word else []
+    near = difflib.get_close_matches(word, TOP_LEVEL, n=1) if "." not in word else []
     near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     if not near:
         leaf = difflib.get_close_matches(word.rsplit(".", 1)[-1], known, n=1, cutoff=0.6)
