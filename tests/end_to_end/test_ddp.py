@@ -10,7 +10,6 @@ OPTIONS = (
 )  # fmt: skip
 
 
-
 def one_process(config_net, batches):
     """Train on given global batches with the same initial weights; returns the state of the network."""
     from lightning.pytorch import seed_everything
