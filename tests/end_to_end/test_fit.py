@@ -76,11 +76,14 @@ def test_recorded_configuration_trains_again(trained, workplace):
 def test_registered_model_runs_through_pyfunc(trained):
     import mlflow
 
-    mlflow.set_tracking_uri(f"sqlite:///{trained.folder / 'runs' / 'mlflow.db'}")
-    model = mlflow.pyfunc.load_model("models:/wskp/1")
+    from trainer.export.register import using_store
+
+    with using_store(f"sqlite:///{trained.folder / 'runs' / 'mlflow.db'}"):
+        model = mlflow.pyfunc.load_model("models:/wskp/1")
     assert model.metadata.signature is not None
     shapes = {"irradiance": 3, "albedo": 3, "normal": 3, "depth": 1}
     inputs = {name: np.ones((1, channels, 20, 31), np.float32) for name, channels in shapes.items()}
+    inputs["exposure"] = np.ones(1, np.float32)  # MLflow has no optional inputs
     color = model.predict(inputs)["color"]
     assert color.shape == (1, 3, 20, 31)
     assert np.allclose(color, 1, atol=1e-5)
