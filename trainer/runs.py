@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -37,7 +37,6 @@ class RunRecord:
     run_id: str | None = None
     unreached_uri: str | None = None
     server_run_id: str | None = None
-    extra: dict[str, str] = field(default_factory=dict)
 
     def save(self, folder: Path) -> None:
         """Write the record whole or not at all."""

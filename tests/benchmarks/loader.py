@@ -30,6 +30,7 @@ from data.module import Shards
 from data.shards.index import Index
 from data.shards.plan import training_epoch
 from data.shards.write import ShardWriter
+from tests.benchmarks.timing import row
 
 SAMPLES, SHARDS, SIZE, BATCH, REPEATS = 384, 8, 128, 8, 7
 HALF = ("irradiance", "albedo", "normal", "reference")
@@ -64,9 +65,9 @@ class PlainBatches(Dataset[dict[str, Tensor]]):
     def __getitem__(self, numbers: list[int]) -> dict[str, Tensor]:
         half = torch.empty(len(numbers), 12, SIZE, SIZE)
         depth = torch.empty(len(numbers), 1, SIZE, SIZE)
-        for row, number in enumerate(numbers):
-            half[row].copy_(torch.from_numpy(self.samples.half[number]))
-            depth[row].copy_(torch.from_numpy(self.samples.depth[number]))
+        for place, number in enumerate(numbers):
+            half[place].copy_(torch.from_numpy(self.samples.half[number]))
+            depth[place].copy_(torch.from_numpy(self.samples.depth[number]))
         return {**{name: half[:, 3 * i : 3 * i + 3] for i, name in enumerate(HALF)}, "depth": depth}
 
 
@@ -143,11 +144,6 @@ def run() -> list[dict[str, Any]]:
         row("memory map, samples and default collation", median["samples"], "samples/s"),
         row("memory map, converted into the batch", median["batches"], "samples/s"),
     ]
-
-
-def row(name: str, value: float, unit: str, target: str = "", meets: bool | None = None) -> dict[str, Any]:
-    """Return one figure."""
-    return {"name": name, "value": value, "unit": unit, "target": target, "meets": meets}
 
 
 if __name__ == "__main__":
