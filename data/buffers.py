@@ -232,6 +232,86 @@ FRAME_NUMBERS: dict[str, int] = {"exposure": 1, "depth_range": 2}
 (1 where absent) and the smallest and largest depth of the whole frame, which a crop cannot know."""
 
 
+@dataclass(frozen=True)
+class SampleChannel:
+    """One quantity that a renderer writes for every sample.
+
+    Attributes:
+        letters: Names of its channels in files, in order.
+        low: Smallest legal value (None: unbounded).
+        high: Largest legal value (None: unbounded).
+        no_hit: Value where the ray left the scene, and what replaces NaN and Inf.
+        half: Whether half precision holds its range and precision.
+        meaning: One sentence.
+    """
+
+    letters: tuple[str, ...]
+    low: float | None
+    high: float | None
+    no_hit: float
+    half: bool
+    meaning: str
+
+
+def _numbers(count: int) -> tuple[str, ...]:
+    return tuple(f"{i:02d}" for i in range(count))
+
+
+def _as_samples(*names: str) -> dict[str, SampleChannel]:
+    """Return the entries of plain buffers, as they are in a single sample."""
+    plain = {name: BUFFERS[name] for name in names}
+    return {
+        n: SampleChannel(tuple(b.letters), b.low, b.high, b.no_hit, b.half, b.meaning)
+        for n, b in plain.items()
+    }
+
+
+SAMPLE_BUFFERS: dict[str, SampleChannel] = {
+    "radiance": SampleChannel(tuple("RGB"), 0.0, None, 0.0, True, "Radiance of the sample, with albedo."),
+    **_as_samples("diffuse", "specular", "normal", "depth", "position", "diffuse_albedo", "specular_albedo"),
+    **_as_samples("roughness", "visibility", "hit"),
+    "motion": SampleChannel(
+        tuple("XY"), None, None, 0.0, True, "Displacement of the hit point over the shutter, in pixels."
+    ),
+    "coc": SampleChannel(
+        ("Z",),
+        None,
+        None,
+        0.0,
+        True,
+        "Signed circle of confusion, a diameter in pixels; > 0 behind the focus.",
+    ),
+    "lens": SampleChannel(tuple("XY"), -1.0, 1.0, 0.0, True, "Position on the lens, in the unit disc."),
+    "time": SampleChannel(("Z",), 0.0, 1.0, 0.0, True, "Time within the shutter."),
+    "offset": SampleChannel(tuple("XY"), 0.0, 1.0, 0.5, True, "Position within the pixel."),
+    "first_normal": SampleChannel(tuple("XYZ"), -1.0, 1.0, 0.0, True, "Normal of the first hit of any kind."),
+    "first_depth": SampleChannel(("Z",), 0.0, None, 0.0, False, "Depth of the first hit of any kind."),
+    "first_albedo": SampleChannel(tuple("RGB"), 0.0, 1.0, 0.0, True, "Albedo of the first hit of any kind."),
+    "path_probability": SampleChannel(
+        _numbers(24), None, None, 0.0, False, "Four probability densities per path vertex (SBMC)."
+    ),
+    "light_direction": SampleChannel(
+        _numbers(12), None, None, 0.0, False, "Two angles to the light per path vertex (SBMC)."
+    ),
+    "bounce": SampleChannel(
+        _numbers(30), 0.0, 1.0, 0.0, True, "Five flags per path vertex: kind of the bounce (SBMC)."
+    ),
+}
+"""What `Frame.samples` may hold per sample. Its channels are called `<name>.<letter>`, such as `radiance.R`."""
+
+
+def sample_channels(*names: str) -> tuple[str, ...]:
+    """Return the channels of per-sample quantities in order, such as `normal.X`, `normal.Y`, `normal.Z`.
+
+    Raises:
+        ValueError: A name is not in the vocabulary.
+    """
+    for name in names:
+        if name not in SAMPLE_BUFFERS:
+            raise ValueError(f"unknown per-sample quantity {name!r}; known: {', '.join(SAMPLE_BUFFERS)}")
+    return tuple(f"{name}.{letter}" for name in names for letter in SAMPLE_BUFFERS[name].letters)
+
+
 def buffer(name: str) -> Buffer:
     """Return the vocabulary entry called `name`.
 

@@ -8,10 +8,65 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import buffer
+from data.buffers import buffer, sample_channels
 from data.camera import Camera
 
 Image = NDArray[np.float32]
+
+
+@dataclass
+class Samples:
+    """The samples of a frame, kept apart.
+
+    Attributes:
+        values: float32 (S, H, W, C), S samples per pixel in no particular order, raw linear values.
+        channels: What the C channels are, such as `radiance.R`; see `data.buffers.SAMPLE_BUFFERS`.
+    """
+
+    values: NDArray[np.float32]
+    channels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check channels, type and shape.
+
+        Raises:
+            ValueError: Says what was expected and what came.
+        """
+        sample_channels(*self.names)
+        if self.channels != sample_channels(*self.names):
+            raise ValueError(f"samples have the channels {self.channels}, some are missing or out of order")
+        shape = self.values.shape
+        if self.values.ndim != 4 or shape[3] != len(self.channels) or min(shape) == 0:
+            raise ValueError(f"samples have shape {shape}, expected (S, H, W, {len(self.channels)})")
+        if self.values.dtype != np.float32:
+            raise ValueError(f"samples are {self.values.dtype}, expected float32")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Quantities in order: radiance, normal …"""
+        return tuple(dict.fromkeys(channel.partition(".")[0] for channel in self.channels))
+
+    @property
+    def count(self) -> int:
+        """Samples per pixel."""
+        return self.values.shape[0]
+
+    def get(self, name: str) -> NDArray[np.float32]:
+        """Return one quantity, a view (S, H, W, c).
+
+        Raises:
+            ValueError: The samples do not have it.
+        """
+        if name not in self.names:
+            raise ValueError(f"the samples have no {name!r}; they have {', '.join(self.names)}")
+        wanted = sample_channels(name)
+        first = self.channels.index(wanted[0])
+        return self.values[..., first : first + len(wanted)]
+
+    @staticmethod
+    def of(parts: dict[str, NDArray[np.float32]]) -> Samples:
+        """Return samples made of quantities, each (S, H, W, c)."""
+        return Samples(np.concatenate(list(parts.values()), -1), sample_channels(*parts))
 
 
 @dataclass
@@ -27,6 +82,7 @@ class Frame:
         spp: Samples per pixel of the noisy buffers, None where unknown.
         accumulated: `irradiance` is accumulated over the preceding frames.
         notes: What was derived, repaired or assumed, for the manifest and `trainer inspect`.
+        samples: The samples of each pixel, where the source keeps them apart.
     """
 
     buffers: dict[str, Image]
@@ -37,6 +93,7 @@ class Frame:
     spp: int | None = None
     accumulated: bool = False
     notes: dict[str, Any] = field(default_factory=dict)
+    samples: Samples | None = None
 
     def __post_init__(self) -> None:
         self.validate()
@@ -76,6 +133,12 @@ class Frame:
                 )
             if array.dtype != np.float32:
                 raise ValueError(f"{self.label}: buffer {name!r} is {array.dtype}, expected float32")
+        size = (self.height, self.width)
+        if self.samples is not None and self.samples.values.shape[1:3] != size:
+            height, width = self.samples.values.shape[1:3]
+            raise ValueError(
+                f"{self.label}: samples are {width}x{height}, the buffers {self.width}x{self.height}"
+            )
 
     def require(self, *names: str) -> None:
         """Raise a ValueError that names the missing buffers, unless all are there."""

@@ -34,6 +34,10 @@ class FrameRecord:
         buffers: Buffer → `half` or `float`, as stored.
         derived: Buffer → rule, for buffers that are not in the file and are computed when it is read.
         repaired: Buffer → number of pixels that were not finite and were replaced.
+        view: Number of the view, where a scene has frames of one view with different samples per pixel.
+        reference_spp: Samples per pixel of `reference`, None where unknown.
+        samples: Quantities that are kept per sample, empty where samples are not kept apart.
+        checks: What was measured when the frame was made, such as `energy_z` and `reference_relmse`.
     """
 
     index: int
@@ -47,6 +51,10 @@ class FrameRecord:
     buffers: dict[str, str] = field(default_factory=dict)
     derived: dict[str, str] = field(default_factory=dict)
     repaired: dict[str, int] = field(default_factory=dict)
+    view: int | None = None
+    reference_spp: int | None = None
+    samples: list[str] = field(default_factory=list)
+    checks: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,7 @@ class SceneRecord:
         credit: Who made the scene.
         license: Under which terms it may be passed on.
         provenance: Renderer, samples per pixel of the reference, changes.
+        origin: Everything needed to make the scene again, where it was made by `trainer render`.
     """
 
     frames: tuple[FrameRecord, ...]
@@ -68,6 +77,7 @@ class SceneRecord:
     credit: str = ""
     license: str = ""
     provenance: str = ""
+    origin: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,7 @@ class Manifest:
         splits: Split → names of scenes; a scene is in one split only, and frames of a scene never divide.
         scenes: Name → record.
         notes: Anything that a reader should know, such as rounding.
+        recipe: Everything else needed to make the set again, where it was made by `trainer render`.
     """
 
     name: str
@@ -89,6 +100,7 @@ class Manifest:
     splits: dict[str, list[str]]
     scenes: dict[str, SceneRecord]
     notes: str = ""
+    recipe: dict[str, Any] = field(default_factory=dict)
 
     @property
     def hash(self) -> str:
