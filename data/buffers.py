@@ -297,7 +297,7 @@ SAMPLE_BUFFERS: dict[str, SampleChannel] = {
         _numbers(30), 0.0, 1.0, 0.0, True, "Five flags per path vertex: kind of the bounce (SBMC)."
     ),
 }
-"""What `Frame.samples` may hold per sample. Its channels are called `<name>.<letter>`, such as `radiance.R`."""
+"""What `Frame.samples` may hold. Channels are called `<name>.<letter>`, such as `radiance.R`."""
 
 
 def sample_channels(*names: str) -> tuple[str, ...]:

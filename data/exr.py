@@ -11,6 +11,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from data.exr_image import HALF_MAX as HALF_MAX
 from data.exr_image import ExrImage as ExrImage
 from data.exr_image import read_exr as read_exr
 from data.exr_image import write_exr as write_exr
+from data.exr_samples import is_sample, read_samples, write_samples
 from data.frame import Frame, Image
 from data.repair import repair
 
@@ -73,7 +75,8 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
     """
     path = Path(path)
     image = read_exr(path)
-    groups, ignored = _groups(image, only)
+    samples, invalid = read_samples(image, _MARK in image.attributes)
+    groups, ignored = _groups(image, only, samples is not None)
     buffers, outside = {}, {}
     for name, channels in groups.items():
         buffers[name] = np.stack([image.channels[c] for c in channels], -1)
@@ -82,7 +85,11 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
             buffers[name][hidden] = buffer(name).no_hit
             outside[name] = int(hidden.sum())
     buffers, repaired = repair(buffers)
-    frame = _described(path, image, buffers)
+    if invalid:
+        repaired["samples"] = invalid
+    if samples is not None and not buffers:
+        buffers["color"] = samples.get("radiance").mean(0)
+    frame = replace(_described(path, image, buffers), samples=samples)
     frame.notes["channels"] = groups
     frame.notes["precision"] = {n: _precision(image, channels) for n, channels in groups.items()}
     for key, value in (("repaired", repaired), ("ignored", ignored), ("outside_data_window", outside)):
@@ -102,7 +109,7 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
     Args:
         frame: What to write, with scene, index, camera, exposure and spp in header attributes.
         path: Target.
-        only: Names of the buffers to write, all of the frame where None.
+        only: Names of the buffers to write; None: all of the frame, and its samples.
 
     Returns:
         Buffer → `half` or `float`, as written.
@@ -125,6 +132,8 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
         precision[name] = "half" if half else "float"
         for i, letter in enumerate(entry.letters):
             channels[f"{name}.{letter}"] = array[..., i].astype(np.float16 if half else np.float32)
+    if frame.samples is not None and only is None:
+        channels |= write_samples(frame.samples)
     write_exr(path, channels, _attributes(frame))
     return precision
 
@@ -173,10 +182,14 @@ def _described(path: Path, image: ExrImage, buffers: dict[str, Image]) -> Frame:
         raise ValueError(f"{path}: cannot understand the file's header or buffers: {error}") from error
 
 
-def _groups(image: ExrImage, only: str | None) -> tuple[dict[str, list[str]], list[str]]:
+def _groups(
+    image: ExrImage, only: str | None, sampled: bool = False
+) -> tuple[dict[str, list[str]], list[str]]:
     """Return buffer → channels in order, and the channels that mean nothing here."""
     layers: dict[str, dict[str, str]] = {}
     for channel in image.channels:
+        if sampled and is_sample(channel):
+            continue
         layer, _, letter = channel.rpartition(".")
         layers.setdefault(layer, {})[letter.upper()] = channel
     groups: dict[str, list[str]] = {}
@@ -191,7 +204,7 @@ def _groups(image: ExrImage, only: str | None) -> tuple[dict[str, list[str]], li
         else:
             groups[name] = channels
             ignored += [c for c in letters.values() if c not in channels]
-    if not groups:
+    if not groups and not sampled:
         found = ", ".join(ignored[:12]) + (f" and {len(ignored) - 12} more" if len(ignored) > 12 else "")
         raise ValueError(f"{image.path}: unknown channel naming: {found}. Known: {KNOWN_NAMINGS}")
     return groups, sorted(ignored)

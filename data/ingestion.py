@@ -119,6 +119,8 @@ def write_record(
 ) -> FrameRecord:
     """Write a frame to its place in a data set and return its record.
 
+    `view`, `reference_spp`, `repaired` and `checks` are taken from the frame's notes.
+
     Raises:
         ValueError: The frame has no exposure, or lacks a named buffer.
         OSError: The file cannot be written.
@@ -131,6 +133,7 @@ def write_record(
     stored = replace(frame, buffers={n: frame.buffers[n] for n in names}, notes={})
     precision = write_frame(stored, output / file)
     known = derive(stored, derivable(stored), depth_kind=depth_kind)
+    told = frame.notes
     return FrameRecord(
         index=frame.index,
         file=file,
@@ -142,7 +145,11 @@ def write_record(
         spp=frame.spp,
         buffers=precision,
         derived=known.notes["derived"],
-        repaired=frame.notes.get("repaired", {}),
+        repaired=told.get("repaired", {}),
+        view=told.get("view"),
+        reference_spp=told.get("reference_spp"),
+        samples=[] if frame.samples is None else list(frame.samples.names),
+        checks=told.get("checks", {}),
     )
 
 

@@ -125,8 +125,14 @@ class Manifest:
         raise ValueError(f"scene {scene!r} is in no split; scenes: {', '.join(self.scenes)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain dictionaries and lists."""
-        return {"format": FORMAT, "version": VERSION, **asdict(self)}
+        """Return plain dictionaries and lists; what came later than version 1 only where it says something."""
+        values = asdict(self)
+        _drop_empty(values, ("recipe",))
+        for scene in values["scenes"].values():
+            _drop_empty(scene, ("origin",))
+            for frame in scene["frames"]:
+                _drop_empty(frame, ("view", "reference_spp", "samples", "checks"))
+        return {"format": FORMAT, "version": VERSION, **values}
 
     @staticmethod
     def from_json(values: Any, source: str = MANIFEST) -> Manifest:
@@ -262,6 +268,12 @@ def make_splits(
     if not train and len(scenes) > 1:
         raise ValueError("no scene is left for training; hold out fewer")
     return {"train": train, "validation": validation, "test": test}
+
+
+def _drop_empty(values: dict[str, Any], names: tuple[str, ...]) -> None:
+    for name in names:
+        if values[name] in (None, [], {}):
+            del values[name]
 
 
 def _record(kind: type[Any], values: dict[str, Any]) -> Any:

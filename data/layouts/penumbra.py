@@ -1,7 +1,7 @@
-"""Layout of Penumbra's own renders: `<scene>/f000_{input,reference,low}.exr` with `sequence.json`.
+"""Layout of Penumbra's first renders: `<scene>/f000_{input,samples,reference,low}.exr` with `sequence.json`.
 
 `video` sets have one noisy colour per frame and a moving camera; `stills` have two halves, variances and
-independent views. In these files `albedo` and `specular` are the diffuse and specular reflectance of the
+independent views; `layers` keep their samples apart, in `samples` instead of `input`. In these files `albedo` and `specular` are the diffuse and specular reflectance of the
 first hit, `depth` is the distance from the camera's centre, and the sidecar holds cameras and exposures.
 """
 
@@ -23,7 +23,7 @@ from data.frame import Frame
 from data.layouts.scene import Scene, all_frames, require_folder
 
 _SIDECAR = "sequence.json"
-_INPUT = re.compile(r"f(\d+)_input\.exr$")
+_INPUT = re.compile(r"f(\d+)_(?:input|samples)\.exr$")
 
 
 def likeness(root: Path) -> float:
@@ -114,7 +114,8 @@ def read(folder: Path, index: int) -> Frame:
     entry = next((f for f in sidecar["frames"] if int(f["index"]) == index), None)
     if entry is None:
         raise ValueError(f"{folder / _SIDECAR}: frame {index} is not described")
-    frame = read_frame(folder / f"f{index:03d}_input.exr")
+    apart = folder / f"f{index:03d}_samples.exr"
+    frame = read_frame(apart if apart.is_file() else folder / f"f{index:03d}_input.exr")
     _reflectances(frame)
     reference = folder / f"f{index:03d}_reference.exr"
     if reference.is_file():
@@ -123,6 +124,9 @@ def read(folder: Path, index: int) -> Frame:
         for key in ("repaired", "precision", "channels"):
             if "reference" in other.notes.get(key, {}):
                 frame.notes.setdefault(key, {})["reference"] = other.notes[key]["reference"]
+    spp = (entry.get("reference") or {}).get("spp")
+    if spp is not None and "reference" in frame.buffers:
+        frame.notes["reference_spp"] = int(spp)
     return replace(
         frame,
         scene=str(sidecar.get("scene") or folder.name),
