@@ -189,6 +189,7 @@ _PLAIN = (
     _radiance("diffuse", "Radiance that left the first hit through its diffuse lobe, with albedo."),
     _radiance("specular", "Radiance that left the first hit through its specular lobes."),
     _radiance("reference", "Converged radiance, with albedo: the target."),
+    _radiance("reference_diffuse", "The part of `reference` that left the first hit through its diffuse lobe."),
     Buffer(
         "history",
         1,
@@ -224,8 +225,11 @@ def _derived(buffer: Buffer) -> tuple[Buffer, ...]:
     return (*halves, variance)
 
 
+_SINGLE = ("reference", "reference_diffuse", "history", "hit")
+"""Buffers without halves and variance."""
+
 BUFFERS: dict[str, Buffer] = {b.name: b for b in _PLAIN}
-BUFFERS |= {d.name: d for b in _PLAIN if b.name not in ("reference", "history", "hit") for d in _derived(b)}
+BUFFERS |= {d.name: d for b in _PLAIN if b.name not in _SINGLE for d in _derived(b)}
 
 FRAME_NUMBERS: dict[str, int] = {"exposure": 1, "depth_range": 2}
 """Numbers of a whole frame and how many each has: the factor that brings radiance to a displayable level

@@ -217,6 +217,7 @@ def _name(image: ExrImage, layer: str, layers: Mapping[str, Any], only: str | No
         return layer if layer in BUFFERS else None
     name = re.sub(r"(?<=[a-z])(A|B)$", lambda m: f"_{m.group(1).lower()}", layer)
     name = re.sub(r"(?<=[a-z])Variance$", "_variance", name)
+    name = {"referenceDiffuse": "reference_diffuse"}.get(name, name)
     base, _, suffix = name.partition("_") if name.endswith(("_a", "_b", "_variance")) else (name, "", "")
     if base == "albedo" and _is_reflectance(image, layers):
         base = "diffuse_albedo"

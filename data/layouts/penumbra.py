@@ -120,10 +120,13 @@ def read(folder: Path, index: int) -> Frame:
     reference = folder / f"f{index:03d}_reference.exr"
     if reference.is_file():
         other = read_frame(reference)
-        frame.buffers["reference"] = other.buffers["reference"]
-        for key in ("repaired", "precision", "channels"):
-            if "reference" in other.notes.get(key, {}):
-                frame.notes.setdefault(key, {})["reference"] = other.notes[key]["reference"]
+        for name in ("reference", "reference_diffuse"):
+            if name not in other.buffers:
+                continue
+            frame.buffers[name] = other.buffers[name]
+            for key in ("repaired", "precision", "channels"):
+                if name in other.notes.get(key, {}):
+                    frame.notes.setdefault(key, {})[name] = other.notes[key][name]
     spp = (entry.get("reference") or {}).get("spp")
     if spp is not None and "reference" in frame.buffers:
         frame.notes["reference_spp"] = int(spp)
@@ -133,7 +136,7 @@ def read(folder: Path, index: int) -> Frame:
         index=index,
         camera=_camera(folder, entry),
         exposure=_exposure(folder, entry),
-        spp=_spp(entry),
+        spp=_spp(entry) or (None if frame.samples is None else frame.samples.count),
     )
 
 

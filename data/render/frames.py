@@ -1,0 +1,137 @@
+"""From traced samples to frames: what each recipe stores of a view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.camera import Camera
+from data.frame import Frame, Image, Samples
+from data.render.moments import Moments, at_counts, over_hits
+from data.render.recipe import Recipe
+from data.render.spec import SceneSpec
+
+HALVES = ("radiance", "diffuse", "normal", "diffuse_albedo", "depth", "visibility")
+"""Quantities of stills that are stored with two halves and the variance of the mean."""
+
+_NAMES = {"radiance": "color"}
+_OVER_HITS = ("depth", "position")
+
+
+class TracedChunk(Protocol):
+    """A few samples per pixel of some rows."""
+
+    rows: slice
+    values: Mapping[str, NDArray[np.float32]]
+
+
+class Tracing(Protocol):
+    """What is used of `data.render.tracer.Tracer`."""
+
+    spec: SceneSpec
+
+    def trace(
+        self,
+        frame: int,
+        spp: int,
+        seed: int,
+        names: Sequence[str],
+        motion: Literal["previous", "shutter"] = ...,
+        static: bool = ...,
+    ) -> Iterator[Any]:
+        """Yield chunks that cover all samples of a frame."""
+        ...
+
+    def pixel_camera(self, frame: int) -> Camera:
+        """Return the camera of a frame."""
+        ...
+
+
+def noisy_frames(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> list[Frame]:
+    """Render the noisy side of a view: a frame per number of samples, without reference and exposure.
+
+    Args:
+        tracer: Of the scene.
+        view: Number of the view.
+        recipe: What to store.
+        seed: Of the samples.
+    """
+    spec = tracer.spec
+    chunks = tracer.trace(
+        view,
+        recipe.spp[-1],
+        seed,
+        recipe.names,
+        motion="shutter" if recipe.kind == "samples" else "previous",
+        static=recipe.kind == "sequences",
+    )
+    if recipe.kind == "samples":
+        buffers, samples = _kept_apart(chunks, recipe)
+        frame = _frame(tracer, view, view, recipe.spp[0], buffers)
+        frame.samples = samples
+        return [frame]
+    frames = []
+    stream = ((chunk.rows, chunk.values) for chunk in chunks)
+    for level, (count, moments) in enumerate(at_counts(stream, recipe.spp, (recipe.height, recipe.width))):
+        buffers = _still(moments) if recipe.kind == "stills" else _means(moments)
+        frames.append(_frame(tracer, view, view * len(recipe.spp) + level, count, buffers))
+    if len(recipe.spp) > 1 or not spec.path:
+        for frame in frames:
+            frame.notes["view"] = view
+    return frames
+
+
+def noisy_color(frame: Frame) -> Image:
+    """Return the noisy radiance of a rendered frame, from its halves where it has them."""
+    if "color" in frame.buffers:
+        return frame.buffers["color"]
+    return np.float32(0.5) * (frame.buffers["color_a"] + frame.buffers["color_b"])
+
+
+def _frame(tracer: Tracing, view: int, index: int, spp: int, buffers: dict[str, Image]) -> Frame:
+    return Frame(buffers, tracer.spec.name, index, tracer.pixel_camera(view), spp=spp)
+
+
+def _means(moments: Mapping[str, Moments]) -> dict[str, Image]:
+    hits = moments["hit"]
+    return {
+        _NAMES.get(name, name): over_hits(m, hits) if name in _OVER_HITS else m.mean()
+        for name, m in moments.items()
+    }
+
+
+def _still(moments: Mapping[str, Moments]) -> dict[str, Image]:
+    """Return means, halves and variances; the colour's mean follows from its halves and is left out."""
+    buffers = _means(moments)
+    del buffers["color"]
+    for name in HALVES:
+        stored = _NAMES.get(name, name)
+        for half in "ab":
+            buffers[f"{stored}_{half}"] = moments[name].half(half)
+        buffers[f"{stored}_variance"] = moments[name].variance()
+    return buffers
+
+
+def _kept_apart(chunks: Iterator[Any], recipe: Recipe) -> tuple[dict[str, Image], Samples]:
+    parts: dict[int, list[Mapping[str, NDArray[np.float32]]]] = {}
+    for chunk in chunks:
+        parts.setdefault(chunk.rows.start, []).append(chunk.values)
+    bands = [
+        {name: np.concatenate([part[name] for part in band]) for name in recipe.names}
+        for _, band in sorted(parts.items())
+    ]
+    whole = {name: np.concatenate([band[name] for band in bands], 1) for name in recipe.names}
+    hit = (whole["depth"] > 0).astype(np.float32)
+    number = np.maximum(hit.sum(0), 1)
+    buffers = {
+        "color": whole["radiance"].mean(0),
+        "normal": whole["normal"].mean(0),
+        "depth": whole["depth"].sum(0) / number,
+        "diffuse_albedo": whole["diffuse_albedo"].mean(0),
+        "specular_albedo": whole["specular_albedo"].mean(0),
+        "hit": hit.mean(0),
+    }
+    return buffers, Samples.of(whole)

@@ -1,0 +1,160 @@
+"""What is rendered of every scene: three recipes, for stills, for sequences and for samples kept apart."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
+
+from data.render.spec import SceneSpec
+
+Kind = Literal["stills", "sequences", "samples"]
+
+PASS_SAMPLES = 2**23
+"""Samples of one pass of a reference: about half a minute of work, which is what an interruption can lose."""
+
+RECIPE_VERSION = 1
+"""Part of every job's key; raise it when the same recipe gives other pixels than before."""
+
+STILLS = (
+    "radiance",
+    "diffuse",
+    "normal",
+    "depth",
+    "position",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "hit",
+    "visibility",
+)
+SEQUENCES = (
+    "radiance",
+    "normal",
+    "depth",
+    "position",
+    "motion",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "hit",
+)
+SAMPLES = (
+    "radiance",
+    "normal",
+    "depth",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "motion",
+    "coc",
+    "lens",
+    "time",
+)
+"""The radiance and the guides of Munkberg and Hasselgren 2020: 20 numbers."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is rendered of every view.
+
+    Attributes:
+        kind: `stills`, `sequences` or `samples`.
+        width: Columns.
+        height: Rows.
+        spp: Samples per pixel of the noisy images, ascending; a view of `stills` gives one frame for each.
+        reference_spp: Samples per pixel of the reference.
+        max_depth: Longest path, in segments.
+        chunk: Samples traced at once. Larger ones need more memory: about 1 kB per sample.
+    """
+
+    kind: Kind
+    width: int
+    height: int
+    spp: tuple[int, ...]
+    reference_spp: int
+    max_depth: int = 8
+    chunk: int = 2**20
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ValueError: Names the option and what was expected.
+        """
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"recipe {self.kind!r}: expected one of {', '.join(get_args(Kind))}")
+        for name in ("width", "height"):
+            if getattr(self, name) < 16:
+                raise ValueError(f"--{name} {getattr(self, name)}: expected at least 16 pixels")
+        if not self.spp or list(self.spp) != sorted(set(self.spp)) or self.spp[0] < 1:
+            raise ValueError(f"--spp {' '.join(map(str, self.spp))}: expected ascending positive numbers")
+        if self.kind == "stills" and any(n % 2 for n in self.spp):
+            odd = next(n for n in self.spp if n % 2)
+            raise ValueError(f"--spp {odd}: stills have two half buffers, so the numbers must be even")
+        if self.kind != "stills" and len(self.spp) > 1:
+            raise ValueError(f"--spp: {self.kind} take one number")
+        if self.reference_spp < 2:
+            raise ValueError(f"--reference-spp {self.reference_spp}: expected at least 2")
+        if self.max_depth < 1 or self.chunk < 1024:
+            raise ValueError(f"--max-depth {self.max_depth}, chunk {self.chunk}: expected >= 1 and >= 1024")
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of a view."""
+        return self.width * self.height
+
+    @property
+    def pass_spp(self) -> int:
+        """Samples per pixel of a pass of the reference; the last pass may have fewer."""
+        return max(1, PASS_SAMPLES // self.pixels)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Quantities of the noisy samples."""
+        return {"stills": STILLS, "sequences": SEQUENCES, "samples": SAMPLES}[self.kind]
+
+    def samples_per_view(self) -> int:
+        """Return how many samples a view needs, reference included."""
+        return self.pixels * (self.spp[-1] + self.reference_spp)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain data for the manifest."""
+        return {**asdict(self), "spp": list(self.spp), "version": RECIPE_VERSION}
+
+    def same_work(self, other: dict[str, Any]) -> bool:
+        """Return whether a manifest's recipe is this one but for the samples of the reference."""
+        mine = {**self.to_json(), "reference_spp": other.get("reference_spp")}
+        return all(other.get(name) == value for name, value in mine.items())
+
+
+def defaults(kind: Kind) -> Recipe:
+    """Return the recipe of a kind where nothing is said: sizes for one machine without a GPU.
+
+    The published sets are larger: BMFR 1280x720 with 4096 samples, AFGSA 1280x720 with 32768, layers 8 and
+    4096 samples.
+    """
+    if kind == "stills":
+        return Recipe(kind, 256, 256, (4, 8, 16, 32, 64, 128), 1024)
+    if kind == "sequences":
+        return Recipe(kind, 320, 180, (1,), 512)
+    return Recipe(kind, 128, 128, (8,), 1024)
+
+
+def view_key(spec: SceneSpec, frame: int, recipe: Recipe) -> str:
+    """Return the hash of everything that decides the pixels of a view, but for the reference's samples."""
+    job = {"origin": spec.origin, "name": spec.name, "frame": frame, "recipe": recipe.to_json()}
+    job["recipe"] = {n: v for n, v in job["recipe"].items() if n != "reference_spp"}
+    return hashlib.sha256(json.dumps(job, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def seed_of(key: str, role: str, number: int = 0) -> int:
+    """Return an independent 31-bit seed for a role (`input`, `reference`) and number of a view's pass."""
+    digest = hashlib.sha256(f"{key}\0{role}\0{number}".encode()).digest()
+    return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
+
+
+def with_options(recipe: Recipe, **options: Any) -> Recipe:
+    """Return a recipe in which the options that are not None replace the defaults."""
+    return replace(recipe, **{name: value for name, value in options.items() if value is not None})

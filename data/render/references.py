@@ -1,0 +1,115 @@
+"""References that grow: sums over passes on disk, refined later by more passes without starting again."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.frame import Image
+
+RELATIVE_FLOOR = 0.01
+"""Added to the squared reference where its relative error is estimated."""
+
+
+@dataclass
+class Reference:
+    """Sums of the passes rendered so far.
+
+    Attributes:
+        passes: Number of passes in the sums.
+        count: Samples per pixel in the sums.
+        total: Sums (H, W, 6): radiance and its diffuse part, float64.
+        squares: Sums of squared radiance (H, W, 3), float64.
+        invalid: Samples that were NaN or Inf and count as 0.
+    """
+
+    passes: int
+    count: int
+    total: NDArray[np.float64] = field(repr=False)
+    squares: NDArray[np.float64] = field(repr=False)
+    invalid: int = 0
+
+    @staticmethod
+    def empty(height: int, width: int) -> Reference:
+        """Return a reference without passes."""
+        return Reference(0, 0, np.zeros((height, width, 6)), np.zeros((height, width, 3)))
+
+    @staticmethod
+    def load(path: Path, height: int, width: int) -> Reference:
+        """Read what an earlier call saved; an empty reference where there is nothing readable."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                passes, count, invalid = (int(n) for n in file["counts"])
+                result = Reference(passes, count, file["total"], file["squares"], invalid)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return Reference.empty(height, width)
+        fits = result.total.shape == (height, width, 6) and result.squares.shape == (height, width, 3)
+        return result if fits else Reference.empty(height, width)
+
+    def save(self, path: Path) -> None:
+        """Write the sums, whole or not at all.
+
+        Raises:
+            OSError: They cannot be written; the file that was there stays.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with temporary.open("wb") as file:
+                counts = np.array([self.passes, self.count, self.invalid], np.int64)
+                np.savez(file, counts=counts, total=self.total, squares=self.squares)
+            os.replace(temporary, path)
+        except OSError as error:
+            raise OSError(f"{path}: cannot write: {error.strerror or error}; check free space") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def add(self, rows: slice, radiance: NDArray[np.float32], diffuse: NDArray[np.float32]) -> None:
+        """Add samples (S, h, W, 3) of a band of rows; the caller counts passes and samples."""
+        self.total[rows, :, :3] += radiance.sum(0, dtype=np.float64)
+        self.total[rows, :, 3:] += diffuse.sum(0, dtype=np.float64)
+        self.squares[rows] += np.einsum("shwc,shwc->hwc", radiance, radiance, dtype=np.float64)
+
+    def radiance(self) -> Image:
+        """Return the mean radiance (H, W, 3)."""
+        return (self.total[..., :3] / self.count).astype(np.float32)
+
+    def diffuse(self) -> Image:
+        """Return the mean of the diffuse part (H, W, 3)."""
+        return (self.total[..., 3:] / self.count).astype(np.float32)
+
+    def sample_variance(self) -> NDArray[np.float64]:
+        """Return the variance of single samples (H, W, 3), 0 while there is one sample only."""
+        mean = self.total[..., :3] / self.count
+        spread = np.maximum(self.squares / self.count - mean * mean, 0)
+        return spread * self.count / max(self.count - 1, 1)
+
+    def relative_error(self) -> float:
+        """Return the reference's own noise: the mean of its variance over (reference^2 + 0.01)."""
+        mean = self.total[..., :3] / self.count
+        return float((self.sample_variance() / self.count / (mean * mean + RELATIVE_FLOOR)).mean())
+
+
+def energy_z(noisy: Image, spp: int, reference: Reference) -> float:
+    """Return how far the mean of a noisy image is from that of its reference, in standard errors.
+
+    Both are means of independent samples of the same pixels, so that
+    `z = (mean(noisy) - mean(reference)) / sqrt(sum(variance) (1 / spp + 1 / n)) * pixels`, with the variance
+    of single samples taken from the reference. The channel with the largest magnitude is returned.
+
+    Args:
+        noisy: Mean radiance (H, W, 3) of `spp` samples per pixel.
+        spp: Its samples per pixel.
+        reference: With `n` samples per pixel.
+    """
+    pixels = noisy.shape[0] * noisy.shape[1]
+    difference = noisy.mean((0, 1), dtype=np.float64) - reference.radiance().mean((0, 1), dtype=np.float64)
+    variance = reference.sample_variance().sum((0, 1)) * (1 / spp + 1 / reference.count)
+    error = np.sqrt(variance) / pixels
+    z = np.where(error > 0, difference / np.where(error > 0, error, 1), np.where(difference == 0, 0, np.inf))
+    return float(z[np.abs(z).argmax()])
