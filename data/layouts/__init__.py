@@ -1,16 +1,32 @@
 """Published on-disk layouts, one file each: a root folder becomes scenes, and scenes become frames.
 
 A layout is a module with `describe(root) -> list[Scene]`, `frames(root) -> Iterator[Frame]` and
-`likeness(root) -> float`, which says from 0 to 1 how much a folder looks like it.
+`likeness(root) -> float`, which says from 0 to 1 how much a folder looks like it. `likeness` looks at names,
+and at the headers of a few files where names do not tell; it never raises for a broken file.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from pathlib import Path
 from typing import Any
 
-LAYOUTS = ("bmfr", "penumbra")
+LAYOUTS = (
+    "acfm",
+    "afgsa",
+    "kpcn",
+    "nbgd",
+    "tungsten",
+    "oidn",
+    "sbmc",
+    "layerdenoise",
+    "blender",
+    "mitsuba",
+    "penumbra",
+    "bmfr",
+)
+"""Names of the layouts; where a folder resembles two equally, the one that asks for more comes first."""
 
 
 def layout(name: str) -> Any:
@@ -20,12 +36,17 @@ def layout(name: str) -> Any:
         ValueError: There is no such layout; the message lists them.
     """
     if name not in LAYOUTS:
-        raise ValueError(f"unknown layout {name!r}; known: {', '.join(LAYOUTS)}")
+        raise ValueError(f"unknown layout {name!r}; known: {', '.join(sorted(LAYOUTS))}")
     return importlib.import_module(f"data.layouts.{name}")
+
+
+def likenesses(root: str | Path) -> dict[str, float]:
+    """Return how much a folder resembles each layout, those that it resembles at all, best first."""
+    present = [name for name in LAYOUTS if importlib.util.find_spec(f"data.layouts.{name}")]
+    scores = {name: layout(name).likeness(Path(root)) for name in present}
+    return dict(sorted(((n, s) for n, s in scores.items() if s > 0), key=lambda pair: -pair[1]))
 
 
 def likeliest(root: str | Path) -> str | None:
     """Return the layout that a folder resembles most, None where it resembles none."""
-    scores = {name: layout(name).likeness(Path(root)) for name in LAYOUTS}
-    best = max(scores, key=lambda name: scores[name])
-    return best if scores[best] > 0 else None
+    return next(iter(likenesses(root)), None)

@@ -35,16 +35,16 @@ def open_hdf5(path: str | Path) -> h5py.File:
     """Open an HDF5 file for reading; the caller closes it.
 
     Raises:
-        ModuleNotFoundError: h5py is not installed; the message says how to install it.
         FileNotFoundError: There is no such file.
-        ValueError: It is no HDF5 file, truncated or damaged.
+        ValueError: It is no HDF5 file, truncated or damaged, or h5py is not installed; the message then says
+            how to install it.
         OSError: It cannot be opened.
     """
     path = Path(path)
     try:
         import h5py
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
+        raise ValueError(
             f"{path} is read with h5py, which is not installed: pip install penumbra-denoise[layouts]"
         ) from error
     if path.is_dir():
