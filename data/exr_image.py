@@ -3,7 +3,8 @@
 Traps of the library (OpenEXR 3.3 to 3.5, its Python module) that this file deals with: channels X, Y, Z are
 merged unless asked not to; the dictionary given for writing is modified, strides of its arrays are ignored; a
 file with damaged pixels raises nothing, prints a line and has fewer parts; headers are emptied when the file
-is closed; pixels outside the data window are the reader's business.
+is closed; pixels outside the data window are the reader's business; memory is allocated for whatever size a
+header claims.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,12 @@ HALF_FLOOR = 2.0**-8
 """Images that nowhere exceed this, but are not zero, are stored in float32: below it half precision has fewer
 than eleven bits for much of a picture's range."""
 
+MAX_BYTES = 1 << 34
+"""Largest image that is read, as float32."""
+
+_MODEST_BYTES = 1 << 28
+_MAX_RATIO = 4096
+_LINES = {"NO": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16, "PXR24": 16, "PIZ": 32, "B44": 32, "B44A": 32, "DWAA": 32}
 _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP = 0x800
 _EIGHT_BIT = {
@@ -81,25 +88,44 @@ def read_exr(path: str | Path) -> ExrImage:
     """
     path = Path(path)
     _check_header(path)
+    headers = _headers(path)
+    expected = len(headers)
+    _check_size(path, headers)
     try:
         # The library prints a warning to standard output where it should raise.
-        with contextlib.redirect_stdout(io.StringIO()):
-            with OpenEXR.File(str(path), separate_channels=True, header_only=True) as head:
-                expected = len(head.parts)
-            with OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file:
-                parts = [
-                    (part.name() or "", dict(file.header(i)), _pixels(part, path))
-                    for i, part in enumerate(file.parts)
-                ]
-    except RuntimeError as error:
-        raise ValueError(
-            f"{path}: damaged or truncated EXR file ({error}); copy or render it again"
-        ) from error
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file,
+        ):
+            parts = [
+                (part.name() or "", dict(file.header(i)), _pixels(part, path))
+                for i, part in enumerate(file.parts)
+            ]
+    except (RuntimeError, MemoryError) as error:
+        raise _damaged(path, error) from error
     if len(parts) < max(expected, 1) or any(array.size == 0 for _, _, p in parts for array in p.values()):
         raise ValueError(f"{path}: truncated or damaged EXR file: pixels missing; copy or render it again")
     if not any(pixels for _, _, pixels in parts):
         raise ValueError(f"{path}: EXR file without channels")
     return _compose(path, parts)
+
+
+def exr_channels(path: str | Path) -> list[str]:
+    """Return the names of a file's channels without reading pixels; names as `read_exr` gives them.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: The file cannot be opened.
+        ValueError: It is empty, no EXR, deep, damaged, or an 8-bit image format.
+    """
+    path = Path(path)
+    _check_header(path)
+    names: list[str] = []
+    headers = _headers(path)
+    for header in headers:
+        for channel in header["channels"]:
+            names.append(_full_name(channel.name, header.get("name") or "", len(headers) > 1, names))
+    return names
 
 
 def write_exr(
@@ -167,6 +193,61 @@ def _check_header(path: Path) -> None:
         raise ValueError(f"{path}: deep EXR images are not supported; flatten it first")
 
 
+def _headers(path: Path) -> list[dict[str, Any]]:
+    try:
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            OpenEXR.File(str(path), separate_channels=True, header_only=True) as file,
+        ):
+            return [dict(file.header(i)) for i in range(len(file.parts))]
+    except (RuntimeError, MemoryError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    reason = str(error) or type(error).__name__
+    return ValueError(f"{path}: damaged or truncated EXR file ({reason}); copy or render it again")
+
+
+def _check_size(path: Path, headers: list[dict[str, Any]]) -> None:
+    """Refuse a size that the file cannot hold or memory cannot, before anything is allocated for it."""
+    stored = path.stat().st_size
+    claimed = placed = chunks = 0
+    for header in headers:
+        width, height = _extent(header["dataWindow"])
+        shown = _extent(header["displayWindow"])
+        if min(width, height, *shown) < 1:
+            raise ValueError(f"{path}: damaged EXR file: a window of the header is empty; render it again")
+        count = len(header["channels"])
+        claimed += width * height * count * 4
+        placed += shown[0] * shown[1] * count * 4
+        if header["type"] == OpenEXR.scanlineimage:
+            lines = _LINES.get(str(header["compression"]).split(".")[-1].partition("_")[0], 256)
+            chunks += -(-height // lines)
+    # Each chunk takes 8 bytes in the table of offsets and at least 8 where it lies.
+    implausible = claimed > max(_MODEST_BYTES, _MAX_RATIO * stored) or 16 * chunks > stored
+    if implausible or placed > max(4 * _MODEST_BYTES, _MAX_RATIO * stored):
+        raise ValueError(
+            f"{path}: the header claims {max(claimed, placed) >> 20} MiB of pixels, but the file has only "
+            f"{stored} bytes: truncated or damaged EXR file; copy or render it again"
+        )
+    if max(claimed, placed) > MAX_BYTES:
+        raise ValueError(
+            f"{path}: {max(claimed, placed) >> 20} MiB of pixels, at most {MAX_BYTES >> 20} MiB are read; "
+            "split the image"
+        )
+
+
+def _extent(window: Any) -> tuple[int, int]:
+    (left, top), (right, bottom) = (np.asarray(v).tolist() for v in window)
+    return right - left + 1, bottom - top + 1
+
+
+def _full_name(name: str, part: str, several: bool, taken: Collection[str]) -> str:
+    full = f"{part}.{name}" if several and part and "." not in name else name
+    return f"{part}.{name}" if full in taken else full
+
+
 def _pixels(part: Any, path: Path) -> dict[str, NDArray[Any]]:
     pixels = {}
     for name, channel in part.channels.items():
@@ -183,9 +264,7 @@ def _compose(path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArra
         (left, top), (right, bottom) = (np.asarray(v).tolist() for v in header["displayWindow"])
         size = (bottom - top + 1, right - left + 1)
         for name, array in pixels.items():
-            full = f"{part}.{name}" if several and part and "." not in name else name
-            if full in image.channels:
-                full = f"{part}.{name}"
+            full = _full_name(name, part, several, image.channels)
             origin = np.asarray(header["dataWindow"][0]) - (left, top)
             placed, outside = _place(array, int(origin[0]), int(origin[1]), size)
             image.channels[full] = placed

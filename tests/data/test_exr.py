@@ -13,6 +13,7 @@ from PIL import Image as Picture
 
 from data.camera import Camera
 from data.exr import RadianceWarning, looks_encoded, read_exr, read_frame, write_exr, write_frame
+from data.exr_image import exr_channels
 from data.frame import Frame
 from data.repair import repair
 from tests.data.miniature import sample_crop, write_rgb
@@ -392,3 +393,48 @@ def test_strided_arrays_are_written_as_they_read(tmp_path):
     image = noise()
     write_exr(tmp_path / "a.exr", {"Z": image[::2, ::3, 1]})
     assert np.array_equal(read_exr(tmp_path / "a.exr").channels["Z"], image[::2, ::3, 1])
+
+
+def claiming(path, last, what=b"dataWindow"):
+    """Write a small file and let a window of its header end at another pixel."""
+    write_exr(path, {"Z": noise(4, 4)[..., 0]})
+    content = bytearray(path.read_bytes())
+    at = content.index(what + b"\0box2i\0") + len(what) + 7 + 4
+    content[at + 8 : at + 16] = b"".join(int(v).to_bytes(4, "little", signed=True) for v in last)
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("window", [b"dataWindow", b"displayWindow"])
+@pytest.mark.parametrize("last", [(31622, 31622), (2**30, 0), (0, 2**30), (10**5, 10**5), (-1, -1)])
+def test_a_header_that_claims_absurd_sizes_is_refused_before_pixels_are_read(
+    tmp_path, monkeypatch, window, last
+):
+    path = claiming(tmp_path / "a.exr", last, window)
+    opened = []
+    library = OpenEXR.File
+
+    def watched(*arguments, **options):
+        opened.append(bool(options.get("header_only")))
+        return library(*arguments, **options)
+
+    monkeypatch.setattr("data.exr_image.OpenEXR.File", watched)
+    with pytest.raises(ValueError, match=r"a\.exr: .*(damaged|at most)"):
+        read_exr(path)
+    assert all(opened)
+
+
+def test_large_pictures_of_one_colour_are_still_read(tmp_path):
+    write_exr(tmp_path / "a.exr", {c: np.zeros((2160, 3840), np.float16) for c in "RGB"})
+    assert (tmp_path / "a.exr").stat().st_size < 2160 * 3840 * 12 / 1000
+    assert read_exr(tmp_path / "a.exr").size == (2160, 3840)
+
+
+def test_channels_are_listed_without_reading_pixels(tmp_path):
+    write_exr(tmp_path / "a.exr", {"normal.R": noise()[..., 0], "Z": noise()[..., 1]})
+    content = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(content[:-40])
+    assert exr_channels(tmp_path / "a.exr") == ["Z", "normal.R"]
+    parts = [OpenEXR.Part({}, {"Z": noise()[..., 0].copy()}, name=name) for name in ("depth", "alpha")]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    assert exr_channels(tmp_path / "parts.exr") == list(read_exr(tmp_path / "parts.exr").channels)
