@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +21,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "path", metavar="PATH", help="an EXR file, a data set, the root of a layout, shards, or sample:bmfr"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument(
+        "--html",
+        metavar="FILE",
+        type=Path,
+        help="write a page with pictures of a data set, and what to look at",
+    )
+    parser.add_argument("--processes", type=int, metavar="N", help="for --html (default: cores, at most 4)")
+    parser.add_argument("--force", action="store_true", help="replace the file of --html")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what was found; returns 0, or 1 where files do not match their checksums.
+    """Print what was found, or write it as a page; returns 0, or 1 where files do not match their checksums.
 
     Raises:
-        ValueError: The path is nothing that can be inspected, or damaged.
-        OSError: It does not exist or cannot be read.
+        ValueError: The path is nothing that can be inspected, or damaged; or the page is there already.
+        OSError: It does not exist or cannot be read, or the page cannot be written.
     """
     from data.inspection import inspect_path
 
-    found = inspect_path(_resolve(args.path))
+    path = _resolve(args.path)
+    if args.html is not None:
+        return _write_page(path, args)
+    found = inspect_path(path)
     if args.json:
         print(json.dumps(found, indent=1, ensure_ascii=False))
     else:
@@ -39,6 +51,54 @@ def run(args: argparse.Namespace) -> int:
 
         _PRINTERS[found["kind"]](found, Console())
     return 1 if found.get("problems") else 0
+
+
+def _write_page(path: Path, args: argparse.Namespace) -> int:
+    from data.ingestion import default_processes
+    from data.manifest import MANIFEST
+    from trainer.commands.ingest import showing
+    from trainer.reports.data_report import write_report
+
+    if args.processes is not None and args.processes < 1:
+        raise ValueError(f"--processes is {args.processes}, expected at least 1")
+    if path.name == MANIFEST and path.is_file():
+        path = path.parent
+    _require_data_set(path)
+    with showing("frames") as progress:
+        found = write_report(
+            path,
+            args.html,
+            force=args.force,
+            processes=args.processes or default_processes(),
+            progress=progress,
+        )
+    if args.json:
+        print(json.dumps([vars(f) for f in found], indent=1, ensure_ascii=False))
+    else:
+        for f in found:
+            print(f"{f.level}: {f.text}" + (f" ({', '.join(f.scenes)})" if f.scenes else ""))
+    size = args.html.stat().st_size / 1e6
+    print(f"{args.html}: {size:.1f} MB; open it in a browser", file=sys.stderr if args.json else sys.stdout)
+    return 1 if any(f.damaged for f in found) else 0
+
+
+def _require_data_set(path: Path) -> None:
+    """Refuse what is no data set, saying what to do with it."""
+    from data.inspection import INDEX
+    from data.layouts import likeliest
+    from data.manifest import MANIFEST
+
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist")
+    if (path / MANIFEST).is_file():
+        return
+    wanted = "--html shows a data set, that is a folder made by `trainer ingest` or `trainer render`"
+    if (path / INDEX).is_file():
+        raise ValueError(f"{path} holds shards; {wanted}: name the one that they were prepared from")
+    layout = likeliest(path) if path.is_dir() else None
+    if layout is not None:
+        raise ValueError(f"{path} has the layout {layout}; {wanted}: ingest it first, with --layout {layout}")
+    raise ValueError(f"{path} is no data set (it has no {MANIFEST}); {wanted}")
 
 
 def _resolve(name: str) -> Path:

@@ -1,0 +1,432 @@
+"""The data report: one static page to look at before training on a data set."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data.frames import FrameSet
+from data.manifest import SPLITS, FrameRecord, Manifest, SceneRecord
+from data.patches import patch_count
+from data.shards.cut import PrepareOptions
+from data.shards.processes import end_with_parent
+from data.statistics import Histogram, Pair, near_duplicates
+from trainer.outputs import refuse_existing, replacing
+from trainer.reports.findings import ENERGY_Z, FIREFLIES, Finding, findings
+from trainer.reports.frame_facts import MAIN, FrameFacts, FrameJob, Pictures, look_at, one_thread
+from trainer.reports.svg import histogram_svg, outside_text, percent, split_svg
+
+Progress = Callable[[int, int, str], None]
+
+LIMITS = (320, 256, 192, 160, 128)
+"""Largest sides of thumbnails, of which the largest that fits the page is taken."""
+
+PAGE = 11e6
+"""Bytes that the thumbnails of a page should stay below."""
+
+BYTES_PER_PIXEL = 0.45
+"""Bytes of a thumbnail's pixel in a page, measured on noisy frames."""
+
+STRIP = 12
+"""Frames of a scene that are shown in a row."""
+
+PAIRS = 30
+"""Pairs of scenes with near duplicates that are shown."""
+
+
+@dataclass
+class SceneView:
+    """What the page shows of a scene.
+
+    Attributes:
+        name: Name of the scene.
+        anchor: Id of its part of the page.
+        split: Split that it belongs to.
+        record: What the manifest says.
+        shown: The frame whose buffers are shown, None where none can be read.
+        facts: All frames that could be read.
+        problems: Why others could not.
+        columns: Frames of the shown view with different numbers of samples, fewest first.
+        strip: Frames in a row.
+        motion: The frame that shows the motion, where it is another one.
+        histograms: Title, drawing, its legend, and what it does not show.
+    """
+
+    name: str
+    anchor: str
+    split: str
+    record: SceneRecord
+    shown: FrameFacts | None = None
+    facts: list[FrameFacts] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    columns: list[FrameFacts] = field(default_factory=list)
+    strip: list[FrameFacts] = field(default_factory=list)
+    motion: FrameFacts | None = None
+    histograms: list[dict[str, Any]] = field(default_factory=list)
+
+
+def write_report(
+    root: str | Path,
+    target: Path,
+    *,
+    force: bool = False,
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Look at all frames of a data set and write the page, whole or not at all.
+
+    Args:
+        root: Folder of the data set.
+        target: The HTML file.
+        force: Replace a file that is there.
+        processes: Number of processes that read frames.
+        progress: Called with frames done, frames in all and the label of the last one.
+
+    Returns:
+        What needs attention, most urgent first.
+
+    Raises:
+        ValueError: The target is there, or the manifest is damaged.
+        OSError: The root is no data set, or the page cannot be written.
+    """
+    if target.is_dir():
+        raise ValueError(f"{target} is a folder; --html names a file, such as {target / 'report.html'}")
+    refuse_existing([target], force)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{target.parent} does not exist; create it or name another --html")
+    frames = FrameSet(root)
+    facts = examine(frames, processes, progress)
+    pairs = near_duplicates([f.print for f in facts], [f.scene for f in facts])
+    found = findings(frames.manifest, facts, pairs)
+    page = render(frames, facts, pairs, found)
+    with replacing(target) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return found
+
+
+def examine(frames: FrameSet, processes: int = 1, progress: Progress | None = None) -> list[FrameFacts]:
+    """Read every frame once and return what was found, in the order of the manifest.
+
+    Raises:
+        OSError: A process was ended from outside.
+    """
+    jobs = make_jobs(frames)
+    facts: list[FrameFacts | None] = [None] * len(jobs)
+    for done, (place, found) in enumerate(_results(jobs, min(processes, len(jobs))), 1):
+        facts[place] = found
+        if progress is not None:
+            progress(done, len(jobs), f"{found.scene}/frame {found.record.index}")
+    return [f for f in facts if f is not None]
+
+
+def _results(jobs: list[FrameJob], processes: int) -> Iterator[tuple[int, FrameFacts]]:
+    if processes <= 1:
+        yield from ((i, look_at(job)) for i, job in enumerate(jobs))
+        return
+    # spawn: the EXR library keeps threads, which do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=_begin) as pool:
+        pending = {pool.submit(look_at, job): i for i, job in enumerate(jobs)}
+        try:
+            for future in as_completed(list(pending)):
+                yield pending.pop(future), future.result()
+        except BrokenProcessPool as error:
+            raise OSError(
+                "a process that reads frames was ended from outside, perhaps for want of memory; "
+                "use fewer --processes"
+            ) from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _begin() -> None:
+    end_with_parent()
+    one_thread()
+
+
+def make_jobs(frames: FrameSet) -> list[FrameJob]:
+    """Return one job per frame, in the order of the manifest, with the pictures that the page will show."""
+    manifest = frames.manifest
+    limit, whole = _sizes(manifest)
+    jobs = []
+    for number, (name, scene) in enumerate(manifest.scenes.items()):
+        shown, columns = shown_frame(scene), column_frames(scene)
+        second = scene.frames[1].index if scene.sequence and len(scene.frames) > 1 else None
+        for record in scene.frames:
+            pictures: Pictures = "none"
+            if record.index == shown.index:
+                pictures = "all" if number < whole else "main"
+            large = record.index == shown.index and max(record.width, record.height) > limit
+            column = large or any(record.index == c.index for c in columns)
+            motion = record.index == second
+            jobs.append(FrameJob(str(frames.root), name, record, pictures, limit, column, motion))
+    return jobs
+
+
+def shown_frame(scene: SceneRecord) -> FrameRecord:
+    """Return the frame whose buffers are shown: the first view, with the most samples there are of it."""
+    return column_frames(scene)[-1] if column_frames(scene) else scene.frames[0]
+
+
+def column_frames(scene: SceneRecord) -> list[FrameRecord]:
+    """Return the frames of the first view, fewest samples first; empty where there is one only."""
+    first = scene.frames[0].view
+    same = [f for f in scene.frames if f.view == first] if first is not None else []
+    return sorted(same, key=lambda f: (f.spp or 0, f.index)) if len(same) > 1 else []
+
+
+def strip_frames(scene: SceneRecord) -> list[FrameRecord]:
+    """Return frames for a row: one of each view, at most `STRIP`, evenly spread."""
+    views: dict[int, FrameRecord] = {}
+    for f in scene.frames:
+        key = f.index if f.view is None else f.view
+        if key not in views or (f.spp or 0) > (views[key].spp or 0):
+            views[key] = f
+    every = list(views.values())
+    if len(every) < 2:
+        return []
+    places = np.linspace(0, len(every) - 1, min(STRIP, len(every))).round().astype(int)
+    return [every[i] for i in places.tolist()]
+
+
+def _sizes(manifest: Manifest) -> tuple[int, int]:
+    """Return the side of the thumbnails, and of how many scenes all buffers are shown."""
+    pictures = []
+    for scene in manifest.scenes.values():
+        first = scene.frames[0]
+        buffers = len({*first.buffers, *first.derived})
+        aspect = min(first.width, first.height) / max(first.width, first.height)
+        pictures.append((buffers + len(column_frames(scene)) + 2, aspect, max(first.width, first.height)))
+
+    def size(limit: int, count: int) -> float:
+        total = 0.0
+        for i, (number, aspect, side) in enumerate(pictures):
+            shown = number if i < count else len(MAIN) + 2
+            total += shown * min(limit, side) ** 2 * aspect * BYTES_PER_PIXEL
+        return total
+
+    for limit in LIMITS:
+        if size(limit, len(pictures)) <= PAGE:
+            return limit, len(pictures)
+    count = next((n for n in range(len(pictures), 0, -1) if size(LIMITS[-1], n) <= PAGE), 1)
+    return LIMITS[-1], count
+
+
+def render(
+    frames: FrameSet, facts: Sequence[FrameFacts], pairs: Sequence[Pair], found: Sequence[Finding]
+) -> str:
+    """Return the page."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "percent": _percent, "json": _json, "mega": _mega}
+    manifest = frames.manifest
+    scenes = [_scene_view(manifest, name, [f for f in facts if f.scene == name]) for name in manifest.scenes]
+    return environment.get_template("data_report.html.j2").render(
+        manifest=manifest,
+        root=frames.root,
+        scenes=scenes,
+        anchors={s.name: s.anchor for s in scenes},
+        findings=found,
+        noise=noise_rows(scenes),
+        splits=split_rows(manifest),
+        split_bar=split_svg({s: _frame_count(manifest, s) for s in SPLITS if manifest.splits.get(s)}),
+        pairs=pair_rows(manifest, facts, pairs),
+        size=_size_text(manifest),
+        bytes=sum(f.bytes for s in manifest.scenes.values() for f in s.frames),
+        version=_version(),
+        energy_z=ENERGY_Z,
+        fireflies=FIREFLIES,
+        patches=PrepareOptions(),
+    )
+
+
+def _scene_view(manifest: Manifest, name: str, facts: list[FrameFacts]) -> SceneView:
+    record = manifest.scenes[name]
+    good = [f for f in facts if not f.problem]
+    by_index = {f.record.index: f for f in good}
+    view = SceneView(name, f"scene-{list(manifest.scenes).index(name)}", manifest.split_of(name), record)
+    view.facts, view.problems = good, [f.problem for f in facts if f.problem]
+    view.shown = by_index.get(shown_frame(record).index)
+    columns = column_frames(record) or [shown_frame(record)]
+    view.columns = [by_index[r.index] for r in columns if r.index in by_index and by_index[r.index].columns]
+    view.strip = [by_index[r.index] for r in strip_frames(record) if r.index in by_index]
+    view.motion = next((f for f in good if f is not view.shown and "motion" in f.thumbnails), None)
+    view.histograms = _histogram_rows(good)
+    return view
+
+
+def _histogram_rows(facts: Sequence[FrameFacts]) -> list[dict[str, Any]]:
+    merged: dict[str, Histogram] = {}
+    for f in facts:
+        for name, h in f.histograms.items():
+            merged[name] = merged[name] + h if name in merged else h
+    groups = {
+        "Luminance, logarithmic": ("color", "reference"),
+        "Depth, logarithmic": ("depth",),
+        "Albedo": ("albedo", "diffuse_albedo", "specular_albedo"),
+        "Length of normals": ("normal",),
+    }
+    rows = []
+    for title, names in groups.items():
+        series = {n: merged[n] for n in names if n in merged and merged[n].total}
+        if series:
+            notes = {n: outside_text(h) for n, h in series.items()}
+            rows.append(
+                {
+                    "title": title,
+                    "svg": histogram_svg(series, title),
+                    "names": list(series) if len(names) > 1 else [],
+                    "notes": [f"{n}: {t}" for n, t in notes.items() if t],
+                }
+            )
+    return rows
+
+
+def noise_rows(scenes: Sequence[SceneView]) -> list[dict[str, Any]]:
+    """Return one row per scene and number of samples: means over its frames, and the worst energy score."""
+    rows = []
+    for scene in scenes:
+        for spp in dict.fromkeys(f.record.spp for f in scene.facts):
+            group = [f for f in scene.facts if f.record.spp == spp]
+            references = sorted({f.record.reference_spp for f in group if f.record.reference_spp})
+            psnr = [f.scores["psnr_wskp"] for f in group if f.scores]
+            scores_z = [f.energy_z for f in group if f.energy_z is not None]
+            pixels = sum(f.record.width * f.record.height * len(f.record.buffers) for f in group)
+            broken = sum(sum(f.record.repaired.values()) for f in group)
+            rows.append(
+                {
+                    "scene": scene,
+                    "spp": spp,
+                    "reference_spp": " to ".join(map(str, dict.fromkeys((references[0], references[-1]))))
+                    if references
+                    else None,
+                    "frames": len(group),
+                    "psnr": _mean(psnr),
+                    "psnr_range": (min(psnr), max(psnr)) if len(psnr) > 1 else None,
+                    "relmse": _mean([f.scores["relmse_layer"] for f in group if f.scores]),
+                    "own": _mean(
+                        [
+                            f.record.checks[k]
+                            for f in group
+                            for k in ("reference_relmse",)
+                            if k in f.record.checks
+                        ]
+                    ),
+                    "fireflies": _mean([f.fireflies for f in group if f.fireflies is not None]),
+                    "broken": broken / pixels if pixels else 0.0,
+                    "no_hit": _mean([f.no_hit for f in group if f.no_hit is not None]),
+                    "ratio": _mean([f.energy_ratio for f in group if f.energy_ratio is not None]),
+                    "z": max(scores_z, key=abs) if scores_z else None,
+                }
+            )
+    return rows
+
+
+def split_rows(manifest: Manifest) -> list[dict[str, Any]]:
+    """Return one row per split: scenes, frames, pixels, and patches that `trainer prepare` would cut."""
+    options = PrepareOptions()
+    rows = []
+    for split in SPLITS:
+        names = manifest.splits.get(split, [])
+        records = [(i, f) for n in names for i, f in enumerate(manifest.scenes[n].frames)]
+        patches = sum(patch_count(options.train_patches, f.width, f.height, i) for i, f in records)
+        rows.append(
+            {
+                "split": split,
+                "scenes": names,
+                "frames": len(records),
+                "pixels": sum(f.width * f.height for _, f in records),
+                "bytes": sum(f.bytes for _, f in records),
+                "patches": patches if split == "train" else None,
+            }
+        )
+    return rows
+
+
+def pair_rows(manifest: Manifest, facts: Sequence[FrameFacts], pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+    """Return one row per pair of scenes that look alike: the most alike frames; different splits first."""
+    groups: dict[tuple[str, str], list[Pair]] = {}
+    for pair in pairs:
+        groups.setdefault((facts[pair.first].scene, facts[pair.second].scene), []).append(pair)
+    rows = []
+    for (a, b), group in groups.items():
+        best = max(group, key=lambda p: p.light + (0 if math.isnan(p.normal) else p.normal))
+        splits = manifest.split_of(a), manifest.split_of(b)
+        rows.append(
+            {
+                "first": facts[best.first],
+                "second": facts[best.second],
+                "splits": splits,
+                "leak": splits[0] != splits[1],
+                "same_view": best.same_view,
+                "light": best.light,
+                "normal": None if math.isnan(best.normal) else best.normal,
+                "count": len(group),
+            }
+        )
+    return sorted(rows, key=_urgency)[:PAIRS]
+
+
+def _urgency(row: Mapping[str, Any]) -> tuple[bool, bool, float]:
+    return not row["leak"], not row["same_view"], -row["light"]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits, – where there is none."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    return f"{value:.{digits}g}".replace("-", "−", 1) if value < 0 else f"{value:.{digits}g}"
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else percent(share)
+
+
+def _mega(count: float) -> str:
+    return f"{count / 1e6:.1f}"
+
+
+def _json(values: Mapping[str, Any]) -> str:
+    return json.dumps(values, indent=1, ensure_ascii=False, sort_keys=True)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _frame_count(manifest: Manifest, split: str) -> int:
+    return sum(len(manifest.scenes[n].frames) for n in manifest.splits.get(split, []))
+
+
+def _size_text(manifest: Manifest) -> str:
+    sizes = sorted({(f.width, f.height) for s in manifest.scenes.values() for f in s.frames})
+    return ", ".join(f"{w}×{h}" for w, h in sizes[:3]) + (
+        f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
+    )
+
+
+def _version() -> str:
+    try:
+        return version("penumbra-denoise")
+    except PackageNotFoundError:
+        return "from source"

@@ -1,0 +1,203 @@
+"""Small pictures of buffers for the data report, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from data.buffers import buffer
+from data.patches import Position
+from trainer.reports.pictures import colors, false_color, tone_map
+
+Array = NDArray[np.float32]
+
+QUALITY = 82
+"""JPEG quality of thumbnails."""
+
+PERCENTILES = (1.0, 99.0)
+"""Values of distances and variances between which the colours of a thumbnail reach."""
+
+
+class Thumbnail(NamedTuple):
+    """A picture in a page.
+
+    Attributes:
+        uri: The picture as a `data:` URI.
+        width: Columns in pixels.
+        height: Rows in pixels.
+        note: How values became colours.
+    """
+
+    uri: str
+    width: int
+    height: int
+    note: str = ""
+
+
+def thumbnail(picture: Image.Image, limit: int, note: str = "", *, flat: bool = False) -> Thumbnail:
+    """Return a picture reduced to at most `limit` columns and rows, as JPEG or PNG, whichever is smaller.
+
+    Args:
+        picture: 8-bit RGB.
+        limit: Largest width and height in pixels.
+        note: Line below it.
+        flat: The colours mean something, so JPEG must keep their resolution.
+    """
+    factor = min(1.0, limit / max(picture.size))
+    if factor < 1:
+        size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
+        picture = picture.resize(size, Image.Resampling.BOX, reducing_gap=None)
+    options: dict[str, dict[str, Any]] = {
+        "JPEG": {"quality": QUALITY, "subsampling": 0 if flat else 2},
+        "PNG": {"optimize": True},
+    }
+    coded = {}
+    for kind, settings in options.items():
+        stream = io.BytesIO()
+        picture.save(stream, kind, **settings)
+        coded[kind] = stream.getvalue()
+    kind = min(coded, key=lambda k: len(coded[k]))
+    text = base64.b64encode(coded[kind]).decode()
+    return Thumbnail(f"data:image/{kind.lower()};base64,{text}", picture.width, picture.height, note)
+
+
+def buffer_thumbnail(name: str, image: Array, exposure: float, limit: int) -> Thumbnail:
+    """Return a buffer as a picture.
+
+    Radiance is tone-mapped at the frame's exposure, reflectance shown with the same curve, normals mapped
+    from [-1, 1], motion shown as hue (direction) and brightness (length), other quantities in false colours:
+    distances between two percentiles, variances on a logarithmic scale.
+
+    Args:
+        name: Word of the vocabulary.
+        image: Values (H, W, C).
+        exposure: Factor to a displayable level.
+        limit: Largest width and height in pixels.
+    """
+    picture, note = picture_of(name, image, exposure)
+    return thumbnail(picture, limit, note, flat=buffer(name).kind != "radiance")
+
+
+def picture_of(name: str, image: Array, exposure: float) -> tuple[Image.Image, str]:
+    """Return the picture of a buffer in full size, and how values became colours."""
+    entry = buffer(name)
+    image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
+    if entry.kind == "radiance":
+        return tone_map(image, exposure), f"× {exposure:.3g}"
+    if entry.kind == "ratio" and entry.channels == 3:
+        return tone_map(image), "0 to 1"
+    if name.startswith("normal") and entry.kind == "vector":
+        return _rgb(image * 0.5 + 0.5), "−1 to 1"
+    if entry.kind == "vector":
+        return _motion(image)
+    if entry.kind == "variance":
+        return _variance(image)
+    if entry.kind == "distance" and entry.channels == 3:
+        return _position(image)
+    if entry.kind == "ratio":
+        return _grey(np.clip(image[..., 0], 0, 1)), "0 to 1"
+    return _distance(image[..., 0], entry.no_hit)
+
+
+def _rgb(values: Array) -> Image.Image:
+    return Image.fromarray(np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8))
+
+
+def _grey(values: Array) -> Image.Image:
+    return _rgb(np.repeat(values[..., None], 3, -1))
+
+
+def _limits(values: Array) -> tuple[float, float]:
+    """Return the percentiles between which values are shown."""
+    if values.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(values, PERCENTILES)
+    return float(low), float(max(high, low + 1e-12 * max(abs(low), 1)))
+
+
+def _distance(values: Array, no_hit: float) -> tuple[Image.Image, str]:
+    """Show near bright and far dark; what hit nothing is black."""
+    hit = values != no_hit
+    low, high = _limits(values[hit])
+    shown = np.where(hit, 0.12 + 0.85 * (1 - np.clip((values - low) / (high - low), 0, 1)), 0)
+    return false_color(shown.astype(np.float32)), f"{low:.3g} (bright) to {high:.3g}"
+
+
+def _position(values: Array) -> tuple[Image.Image, str]:
+    """Show X, Y, Z as R, G, B, each between its percentiles."""
+    hit = (values != 0).any(-1)
+    shown = np.zeros_like(values)
+    for axis in range(3):
+        low, high = _limits(values[..., axis][hit])
+        shown[..., axis] = np.where(hit, np.clip((values[..., axis] - low) / (high - low), 0, 1), 0)
+    return _rgb(shown), "X, Y, Z as R, G, B"
+
+
+def _variance(values: Array) -> tuple[Image.Image, str]:
+    mean = values.mean(-1)
+    positive = mean[mean > 0]
+    if positive.size == 0:
+        return false_color(np.zeros_like(mean)), "0 everywhere"
+    low, high = _limits(np.log10(positive))
+    logs = np.log10(np.maximum(mean, np.float32(10.0**low)))
+    shown = np.where(mean > 0, 0.1 + 0.9 * np.clip((logs - low) / (high - low), 0, 1), 0)
+    return false_color(shown.astype(np.float32)), f"log, {10**low:.1e} to {10**high:.1e}"
+
+
+def _motion(values: Array) -> tuple[Image.Image, str]:
+    """Show direction as hue, length as brightness."""
+    length = np.hypot(values[..., 0], values[..., 1])
+    longest = float(np.percentile(length, PERCENTILES[1]))
+    if longest == 0:
+        return _grey(np.zeros_like(length)), "0 everywhere"
+    hue = (np.arctan2(values[..., 1], values[..., 0]) / (2 * np.pi)) % 1
+    planes = np.stack([hue, np.full_like(hue, 0.85), np.clip(length / longest, 0, 1)], -1)
+    coded = np.rint(planes * 255).astype(np.uint8)
+    return Image.fromarray(coded, "HSV").convert("RGB"), f"hue: direction, up to {longest:.2g} px"
+
+
+def window(image: Array, side: int) -> Array:
+    """Return the middle of an image (H, W, C), at most `side` columns and rows: pixels in their own size."""
+    height, width = image.shape[:2]
+    y, x = max(0, (height - side) // 2), max(0, (width - side) // 2)
+    return image[y : y + side, x : x + side]
+
+
+def coverage(positions: list[Position], size: tuple[int, int], patch: int) -> Array:
+    """Return how many patches cover each pixel, (H, W).
+
+    Args:
+        positions: Top left pixels of the patches.
+        size: Width and height of the frame.
+        patch: Width and height of a patch.
+    """
+    width, height = size
+    corners = np.zeros((height + 1, width + 1), np.float32)
+    for x, y in positions:
+        left, top = min(max(x, 0), width), min(max(y, 0), height)
+        right, bottom = min(max(x + patch, 0), width), min(max(y + patch, 0), height)
+        corners[top, left] += 1
+        corners[bottom, right] += 1
+        corners[top, right] -= 1
+        corners[bottom, left] -= 1
+    return corners.cumsum(0).cumsum(1)[:height, :width]
+
+
+def density_picture(color: Array, exposure: float, values: Array, highest: float) -> Image.Image:
+    """Return a frame in grey under the false colours of a density.
+
+    Args:
+        color: Radiance (H, W, 3).
+        exposure: Factor to a displayable level.
+        values: Density (H, W), from 0.
+        highest: Density of the brightest colour.
+    """
+    grey = np.asarray(tone_map(color, exposure).convert("L"), np.float32)[..., None]
+    share = np.clip(values / max(highest, 1e-12), 0, 1)
+    painted = colors()[np.rint(40 + 215 * share).astype(np.intp)].astype(np.float32)
+    return Image.fromarray(np.rint(0.4 * grey + 0.6 * painted).astype(np.uint8))
