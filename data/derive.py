@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data import camera as cameras
+from data.buffers import BUFFERS
 from data.camera import Camera, DepthKind
 from data.frame import Frame, Image
 
@@ -82,12 +83,14 @@ def derive(
     *,
     depth_kind: DepthKind = "euclidean",
     previous: Camera | None = None,
+    variance_from_halves: bool = False,
 ) -> Frame:
     """Return the frame with the named buffers added where they are absent.
 
-    albedo from diffuse_albedo and specular_albedo; irradiance = color / albedo; color = irradiance * albedo,
-    or the mean of color_a and color_b; depth from position and camera; motion from position and both cameras;
-    specular = color - diffuse; hit from depth; history 1 for frames that are not accumulated.
+    albedo from diffuse_albedo and specular_albedo; irradiance = color / albedo; color = diffuse + specular,
+    irradiance * albedo; specular = color - diffuse and the reverse; depth from position and camera; motion
+    from position and both cameras; hit from depth; history 1 for frames that are not accumulated. Any buffer
+    is the mean of its halves of equal size, and either half is twice the mean less the other.
     `notes["derived"]` of the result records each with its rule.
 
     Args:
@@ -95,13 +98,15 @@ def derive(
         names: Buffers that are wanted; those already there are not touched.
         depth_kind: What depth means in this data set.
         previous: Camera of the preceding frame, for motion.
+        variance_from_halves: Allow `<name>_variance` = ((a - b) / 2)^2, which is right in the mean but has,
+            with two values per pixel, as much noise as signal: filter it before use.
 
     Raises:
         ValueError: A buffer is absent and what it would be derived from is too; the message names both.
     """
     result = frame.with_buffers()
     result.notes["derived"] = dict(frame.notes.get("derived", {}))
-    context = _Context(result, depth_kind, previous)
+    context = _Context(result, depth_kind, previous, variance_from_halves)
     for name in names:
         context.need(name)
     return result
@@ -110,15 +115,19 @@ def derive(
 class _Context:
     """One call of `derive`: the growing frame and the parameters of its rules."""
 
-    def __init__(self, frame: Frame, depth_kind: DepthKind, previous: Camera | None) -> None:
+    def __init__(
+        self, frame: Frame, depth_kind: DepthKind, previous: Camera | None, variance_from_halves: bool
+    ) -> None:
         self.frame, self.depth_kind, self.previous = frame, depth_kind, previous
+        self.variance_from_halves = variance_from_halves
         self.rules: dict[str, Callable[[], tuple[Image, str]]] = {
             "albedo": self._albedo,
             "irradiance": self._irradiance,
             "color": self._color,
             "depth": self._depth,
             "motion": self._motion,
-            "specular": self._specular,
+            "diffuse": lambda: self._rest("diffuse", "specular"),
+            "specular": lambda: self._rest("specular", "diffuse"),
             "hit": self._hit,
             "history": self._history,
         }
@@ -126,12 +135,33 @@ class _Context:
     def need(self, name: str) -> Image:
         buffers = self.frame.buffers
         if name not in buffers:
-            if name not in self.rules:
-                self.frame.require(name)
-            array, rule = self.rules[name]()
+            array, rule = self._of_halves(name) or self._rule(name)
             buffers[name] = np.ascontiguousarray(array, np.float32)
             self.frame.notes["derived"][name] = rule
         return buffers[name]
+
+    def _rule(self, name: str) -> tuple[Image, str]:
+        if name not in self.rules:
+            self.frame.require(name)
+        return self.rules[name]()
+
+    def _of_halves(self, name: str) -> tuple[Image, str] | None:
+        """Derive a mean, a half or a variance from what there is of the mean and its halves."""
+        buffers = self.frame.buffers
+        if {f"{name}_a", f"{name}_b"} <= buffers.keys():
+            mean = np.float32(0.5) * (buffers[f"{name}_a"] + buffers[f"{name}_b"])
+            return mean, f"mean of {name}_a and {name}_b"
+        base, _, part = name.rpartition("_")
+        if part in ("a", "b"):
+            other = f"{base}_{'b' if part == 'a' else 'a'}"
+            if {base, other} <= buffers.keys():
+                return 2 * buffers[base] - buffers[other], f"2 * {base} - {other}"
+        if part == "variance" and self.variance_from_halves and base in BUFFERS:
+            halves = [f"{base}_a", f"{base}_b"]
+            if base in buffers or set(halves) <= buffers.keys():
+                a, b = (self.need(half) for half in halves)
+                return (np.float32(0.5) * (a - b)) ** 2, f"(({base}_a - {base}_b) / 2)^2"
+        return None
 
     def _fail(self, name: str, needed: str) -> ValueError:
         return ValueError(
@@ -148,16 +178,16 @@ class _Context:
         return effective_albedo(diffuse, specular), f"{names}, 1 where 0, at least {ALBEDO_FLOOR}"
 
     def _irradiance(self) -> tuple[Image, str]:
-        if not {"color", "color_a"} & self.frame.buffers.keys():
+        if not {"color", "color_a", "diffuse"} & self.frame.buffers.keys():
             raise self._fail("irradiance", "color")
         return demodulate(self.need("color"), self.need("albedo")), "color / albedo"
 
     def _color(self) -> tuple[Image, str]:
         buffers = self.frame.buffers
-        if "color_a" in buffers and "color_b" in buffers:
-            return np.float32(0.5) * (buffers["color_a"] + buffers["color_b"]), "mean of color_a and color_b"
+        if {"diffuse", "specular"} <= buffers.keys():
+            return buffers["diffuse"] + buffers["specular"], "diffuse + specular"
         if "irradiance" not in buffers:
-            raise self._fail("color", "irradiance and albedo, or color_a and color_b,")
+            raise self._fail("color", "irradiance and albedo, diffuse and specular, or color_a and color_b,")
         return remodulate(buffers["irradiance"], self.need("albedo")), "irradiance * albedo"
 
     def _depth(self) -> tuple[Image, str]:
@@ -182,12 +212,13 @@ class _Context:
         motion = cameras.motion(position, camera, self.previous)
         return np.where(no_hit(self.frame), np.float32(0), motion), "position and both cameras"
 
-    def _specular(self) -> tuple[Image, str]:
-        if "diffuse" not in self.frame.buffers:
-            raise self._fail("specular", "diffuse")
-        return np.maximum(
-            self.need("color") - self.frame.buffers["diffuse"], 0
-        ), "color - diffuse, at least 0"
+    def _rest(self, name: str, other: str) -> tuple[Image, str]:
+        if other not in self.frame.buffers:
+            raise self._fail(name, other)
+        if not {"color", "color_a", "irradiance"} & self.frame.buffers.keys():
+            raise self._fail(name, "color")
+        rest = self.need("color") - self.frame.buffers[other]
+        return np.maximum(rest, 0), f"color - {other}, at least 0"
 
     def _hit(self) -> tuple[Image, str]:
         return (self.need("depth") > 0).astype(np.float32), "depth > 0"
