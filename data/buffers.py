@@ -189,7 +189,7 @@ _PLAIN = (
     _radiance("diffuse", "Radiance that left the first hit through its diffuse lobe, with albedo."),
     _radiance("specular", "Radiance that left the first hit through its specular lobes."),
     _radiance("reference", "Converged radiance, with albedo: the target."),
-    _radiance("reference_diffuse", "The part of `reference` that left the first hit through its diffuse lobe."),
+    _radiance("reference_diffuse", "The part of `reference` that left its first hit as diffuse light."),
     Buffer(
         "history",
         1,

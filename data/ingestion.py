@@ -202,7 +202,7 @@ def _prepare_output(output: Path, name: str, root: Path, options: IngestOptions)
     if (output / MANIFEST).exists():
         if not options.force:
             raise ValueError(f"{output} already holds a data set; --force replaces it")
-        _remove_set(output)
+        remove_set(output)
     elif partial_folder.is_dir():
         if _job(partial_folder) == job:
             return
@@ -228,7 +228,7 @@ def _job(folder: Path) -> Any:
         return None
 
 
-def _remove_set(output: Path) -> None:
+def remove_set(output: Path) -> None:
     """Remove the files that a manifest lists, and nothing else."""
     try:
         files = [f.file for scene in load_manifest(output).scenes.values() for f in scene.frames]

@@ -125,7 +125,7 @@ class Manifest:
         raise ValueError(f"scene {scene!r} is in no split; scenes: {', '.join(self.scenes)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain dictionaries and lists; what came later than version 1 only where it says something."""
+        """Return plain dictionaries and lists; later additions to version 1 only where they say something."""
         values = asdict(self)
         _drop_empty(values, ("recipe",))
         for scene in values["scenes"].values():

@@ -32,6 +32,7 @@ class Tracing(Protocol):
     """What is used of `data.render.tracer.Tracer`."""
 
     spec: SceneSpec
+    invalid: int
 
     def trace(
         self,

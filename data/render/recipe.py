@@ -7,8 +7,6 @@ import json
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
-from data.render.spec import SceneSpec
-
 Kind = Literal["stills", "sequences", "samples"]
 
 PASS_SAMPLES = 2**23
@@ -142,11 +140,17 @@ def defaults(kind: Kind) -> Recipe:
     return Recipe(kind, 128, 128, (8,), 1024)
 
 
-def view_key(spec: SceneSpec, frame: int, recipe: Recipe) -> str:
-    """Return the hash of everything that decides the pixels of a view, but for the reference's samples."""
-    job = {"origin": spec.origin, "name": spec.name, "frame": frame, "recipe": recipe.to_json()}
-    job["recipe"] = {n: v for n, v in job["recipe"].items() if n != "reference_spp"}
-    return hashlib.sha256(json.dumps(job, sort_keys=True).encode()).hexdigest()[:24]
+def view_key(identity: dict[str, Any], frame: int, recipe: Recipe) -> str:
+    """Return the hash of everything that decides the pixels of a view, but for the reference's samples.
+
+    Args:
+        identity: What tells the scene from others; plain JSON.
+        frame: Number of the view.
+        recipe: What is rendered.
+    """
+    kept = {name: value for name, value in recipe.to_json().items() if name != "reference_spp"}
+    job = json.dumps({"scene": identity, "frame": frame, "recipe": kept}, sort_keys=True)
+    return hashlib.sha256(job.encode()).hexdigest()[:24]
 
 
 def seed_of(key: str, role: str, number: int = 0) -> int:

@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from data.frame import Image
 
+ENERGY_LIMIT = 4.0
+"""Standard errors beyond which the mean of a noisy frame counts as different from that of its reference: one
+frame in 5000 with three channels of normal noise."""
+
 RELATIVE_FLOOR = 0.01
 """Added to the squared reference where its relative error is estimated."""
 

@@ -1,0 +1,78 @@
+"""What a rendering process does: load a scene, then its views one after the other."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+from data.render.recipe import Recipe
+from data.render.sources import Source
+from data.render.tracer import Tracer
+from data.render.variant import Variant, activate
+from data.render.views import ViewWork, render_view
+
+
+@dataclass(frozen=True)
+class Task:
+    """Views of one scene."""
+
+    source: Source
+    works: list[ViewWork]
+
+
+class _Process:
+    """What a process was told when it started."""
+
+    reports: Any = None
+    parent: int = 0
+    renderer: str = ""
+
+
+def start(variant: Variant, threads: int, reports: Any, parent: int) -> None:
+    """Prepare a process: choose the renderer's variant and its threads."""
+    activate(variant, threads)
+    _Process.reports, _Process.parent = reports, parent
+    _Process.renderer = f"Mitsuba {version('mitsuba')} ({variant.name})"
+
+
+def render_task(task: Task) -> None:
+    """Render the views of a task, and report samples as they are done.
+
+    Raises:
+        ValueError: The scene cannot be made or rendered; the message names it.
+        OSError: A file cannot be written.
+    """
+    _report(0, f"{task.source.name}: preparing")
+    spec = task.source.build()
+    recipe = task.works[0].recipe
+    try:
+        tracer = Tracer(spec, chunk=recipe.chunk, max_depth=recipe.max_depth)
+        for work in task.works:
+            label = f"{work.scene}, view {work.view}"
+            render_view(work, tracer, _Process.renderer, partial(_report, label=label))
+    except RuntimeError as error:
+        raise ValueError(f"scene {spec.name!r}: the renderer failed: {error}") from error
+
+
+def speed_of(source: Source, recipe: Recipe) -> float:
+    """Return the samples per second of a reference, measured on the second pass; the first one compiles."""
+    tracer = Tracer(source.build(), chunk=recipe.chunk, max_depth=recipe.max_depth)
+    spp = max(1, min(recipe.reference_spp, recipe.chunk // recipe.pixels))
+    seconds = 0.0
+    for seed in range(2):
+        began = time.perf_counter()
+        for _ in tracer.trace(0, spp, seed, ("radiance", "diffuse")):
+            pass
+        seconds = time.perf_counter() - began
+    return spp * recipe.pixels / seconds
+
+
+def _report(count: int, label: str) -> None:
+    """Tell the parent; end with it, so that a killed command leaves nothing behind that renders."""
+    if os.getppid() != _Process.parent:
+        os._exit(1)
+    _Process.reports.put((count, label))

@@ -1,0 +1,195 @@
+import json
+
+import numpy as np
+import pytest
+
+from data.exr import read_frame
+from data.manifest import FrameRecord
+from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
+from data.render.references import Reference, energy_z
+from data.render.views import ViewWork, add_pass, render_view
+from tests.data.render.fake_tracer import FakeTracer
+
+STILLS = Recipe("stills", 24, 16, (2, 4), 64)
+
+
+def work(root, recipe=STILLS, key="k"):
+    return ViewWork(root, "fake", 0, key, recipe)
+
+
+def records(done):
+    return [FrameRecord(**r) for r in json.loads(done.memory.read_text())["records"]]
+
+
+def render(done, tracer=None):
+    counts = []
+    render_view(done, tracer or FakeTracer(), "renderer 1", counts.append)
+    return counts
+
+
+def test_a_still_has_a_frame_per_count_with_halves_variances_and_both_references(tmp_path):
+    done = work(tmp_path)
+    render(done)
+    low, high = records(done)
+    assert [(r.index, r.view, r.spp, r.reference_spp) for r in (low, high)] == [(0, 0, 2, 64), (1, 0, 4, 64)]
+    frame = read_frame(tmp_path / high.file)
+    for name in ("color", "diffuse", "normal", "diffuse_albedo", "depth", "visibility"):
+        assert {f"{name}_a", f"{name}_b", f"{name}_variance"} <= frame.buffers.keys()
+    assert {
+        "reference",
+        "reference_diffuse",
+        "position",
+        "roughness",
+        "specular_albedo",
+    } <= frame.buffers.keys()
+    assert frame.exposure == pytest.approx(high.exposure)
+
+
+def test_counts_of_a_still_come_from_one_stream(tmp_path):
+    tracer = FakeTracer()
+    render(work(tmp_path), tracer)
+    assert [spp for _, spp, _ in tracer.calls] == [4, 64]
+
+
+def test_the_difference_of_the_halves_estimates_the_variance(tmp_path):
+    done = work(tmp_path, Recipe("stills", 24, 16, (64,), 64))
+    render(done)
+    frame = read_frame(tmp_path / records(done)[0].file)
+    squared = ((frame.buffers["color_a"] - frame.buffers["color_b"]) / 2) ** 2
+    assert squared.mean() == pytest.approx(frame.buffers["color_variance"].mean(), rel=0.2)
+
+
+def test_depth_of_pixels_that_hit_nothing_is_zero_and_others_keep_their_distance(tmp_path):
+    done = work(tmp_path)
+    render(done)
+    depth = read_frame(tmp_path / records(done)[1].file).buffers["depth"][..., 0]
+    assert (depth[:, 12:] == 0).all()
+    assert ((depth[:, :12] >= 1) & (depth[:, :12] <= 3)).all()
+
+
+def test_samples_are_kept_apart_and_their_mean_is_the_colour(tmp_path):
+    done = work(tmp_path, Recipe("samples", 24, 16, (8,), 16))
+    render(done, FakeTracer(chunk=1024))
+    frame = read_frame(tmp_path / records(done)[0].file)
+    assert (frame.samples.count, len(frame.samples.channels)) == (8, 20)
+    assert np.allclose(frame.buffers["color"], frame.samples.get("radiance").mean(0), rtol=2e-3, atol=1e-3)
+
+
+def test_a_second_call_does_nothing(tmp_path):
+    done = work(tmp_path)
+    render(done)
+    before = records(done)
+    tracer = FakeTracer()
+    assert render(done, tracer) == []
+    assert tracer.calls == []
+    assert records(done) == before
+
+
+def test_more_reference_samples_are_added_to_what_is_there(tmp_path):
+    render(work(tmp_path))
+    tracer = FakeTracer()
+    finer = with_options(STILLS, reference_spp=96)
+    done = work(tmp_path, finer)
+    assert render(done, tracer) == [finer.pixels * 32]
+    assert [spp for _, spp, _ in tracer.calls] == [32]
+    assert records(done)[0].reference_spp == 96
+
+
+def test_a_reference_refined_by_whole_passes_equals_one_rendered_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr("data.render.recipe.PASS_SAMPLES", 24 * 16 * 32)
+    render(work(tmp_path / "a", with_options(STILLS, reference_spp=32)))
+    render(work(tmp_path / "a", with_options(STILLS, reference_spp=96)))
+    render(work(tmp_path / "b", with_options(STILLS, reference_spp=96)))
+    for a, b in zip(records(work(tmp_path / "a")), records(work(tmp_path / "b")), strict=True):
+        assert a.sha256 == b.sha256
+
+
+class StoppedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("calls", [1, 2, 3])
+def test_stopped_at_any_pass_it_goes_on_to_the_same_files(tmp_path, monkeypatch, calls):
+    monkeypatch.setattr("data.render.recipe.PASS_SAMPLES", 24 * 16 * 16)
+
+    class Failing(FakeTracer):
+        def trace(self, *args, **kwargs):
+            if len(self.calls) == calls:
+                raise StoppedError
+            return super().trace(*args, **kwargs)
+
+    with pytest.raises(StoppedError):
+        render(work(tmp_path / "a"), Failing())
+    resumed = FakeTracer()
+    render(work(tmp_path / "a"), resumed)
+    assert len(resumed.calls) == 5 - calls
+    render(work(tmp_path / "b"))
+    for a, b in zip(records(work(tmp_path / "a")), records(work(tmp_path / "b")), strict=True):
+        assert a.sha256 == b.sha256
+
+
+def test_an_altered_frame_is_rendered_again_with_the_reference_that_is_there(tmp_path):
+    done = work(tmp_path)
+    render(done)
+    before = records(done)
+    (tmp_path / before[0].file).write_bytes(b"broken")
+    tracer = FakeTracer()
+    render(done, tracer)
+    assert [spp for _, spp, _ in tracer.calls] == [4]
+    assert records(done) == before
+
+
+def test_damaged_sums_of_a_reference_start_it_anew(tmp_path):
+    render(work(tmp_path))
+    work(tmp_path).sums.write_bytes(b"PK damaged")
+    assert Reference.load(work(tmp_path).sums, 16, 24).count == 0
+
+
+def test_energy_of_equal_means_is_within_three_errors_and_of_brighter_input_is_not():
+    def noisy(scale, seed):
+        tracer = FakeTracer(scale=scale)
+        parts = list(tracer.trace(0, 4, seed, ("radiance",)))
+        values = np.concatenate([p.values["radiance"] for p in parts])
+        return values.mean(0)
+
+    reference = Reference.empty(16, 24)
+    add_pass(reference, FakeTracer(), work(None, Recipe("samples", 24, 16, (4,), 64)))
+    assert all(abs(energy_z(noisy(1.0, seed), 4, reference)) < 4 for seed in range(20))
+    assert energy_z(noisy(1.3, 1), 4, reference) > 5
+
+
+def test_standard_errors_of_the_energy_have_unit_spread():
+    reference = Reference.empty(16, 24)
+    add_pass(reference, FakeTracer(), work(None, Recipe("samples", 24, 16, (4,), 256)))
+    zs = []
+    for seed in range(200):
+        (part,) = FakeTracer(chunk=2**20).trace(0, 4, 1000 + seed, ("radiance",))
+        zs.append(energy_z(part.values["radiance"].mean(0), 4, reference))
+    # The largest of three standard normal numbers has a root mean square of 1.58.
+    assert np.sqrt(np.mean(np.square(zs))) == pytest.approx(1.58, abs=0.25)
+
+
+def test_keys_depend_on_scene_view_and_recipe_but_not_on_the_reference_samples():
+    key = view_key({"seed": 1}, 0, STILLS)
+    assert key == view_key({"seed": 1}, 0, with_options(STILLS, reference_spp=5000))
+    others = [
+        view_key({"seed": 2}, 0, STILLS),
+        view_key({"seed": 1}, 1, STILLS),
+        view_key({"seed": 1}, 0, with_options(STILLS, spp=(2, 8))),
+    ]
+    assert len({key, *others}) == 4
+    assert len({seed_of(key, "input"), seed_of(key, "reference", 0), seed_of(key, "reference", 64)}) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spp": (3,)}, "must be even"),
+        ({"spp": (4, 2)}, "ascending"),
+        ({"reference_spp": 1}, "at least 2"),
+        ({"width": 8}, "at least 16"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        with_options(defaults("stills"), **options)

@@ -1,0 +1,263 @@
+"""`trainer render`: make a data set with a path tracer."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from data.render.recipe import Recipe
+    from data.render.sources import Source
+    from data.render.variant import Variant
+
+HELP = "render a data set with Mitsuba: random scenes, or yours"
+
+DESCRIPTION = """\
+Makes a data set that `trainer prepare` and `trainer fit` take, with references, from random scenes or Mitsuba
+files. Interrupted, the same command goes on; with a larger --reference-spp it refines what is there.
+
+  stills      for AFGSA, ACFM, KPCN, NFOR: diffuse and specular light, guides, two half buffers and the
+              variance of the mean of every buffer, at several samples per pixel of the same stream
+  sequences   for WSKP, BMFR, SVGF: 1 sample per pixel, positions, motion vectors, a moving camera
+  samples     for layer embeddings, sample splatting: every sample apart, with 20 numbers
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.description = DESCRIPTION
+    parser.add_argument("kind", choices=("stills", "sequences", "samples"), help="what is made of each scene")
+    parser.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder of the data set")
+    _scene_arguments(parser.add_argument_group("scenes"))
+    _image_arguments(parser.add_argument_group("images"))
+    work = parser.add_argument_group("work")
+    work.add_argument("--processes", type=int, help="rendering processes (default: one per two cores)")
+    work.add_argument("--variant", choices=("auto", "llvm", "scalar"), default="auto", help="of Mitsuba")
+    work.add_argument(
+        "--dry-run", action="store_true", help="print what would be rendered, its size and time"
+    )
+    work.add_argument("--force", action="store_true", help="replace frames of another recipe in DIR")
+
+
+def _scene_arguments(group: Any) -> None:
+    group.add_argument("--random", metavar="N", type=int, default=0, help="N random scenes")
+    group.add_argument("--seed", type=int, default=1, help="seed of the first random scene (default 1)")
+    group.add_argument(
+        "--places",
+        nargs="+",
+        choices=("outdoor", "indoor"),
+        default=("outdoor", "indoor"),
+        help="kinds, in turn",
+    )
+    for name, what in (("meshes", "OBJ, PLY, glTF"), ("textures", "PNG, JPEG"), ("environments", "EXR, HDR")):
+        group.add_argument(f"--{name}", metavar="DIR", type=Path, help=f"your {name} to mix in ({what})")
+    group.add_argument(
+        "--scene", metavar="FILE", type=Path, action="append", default=[], help="a Mitsuba file"
+    )
+    group.add_argument(
+        "--camera",
+        default="auto",
+        metavar="MOVE",
+        help="of Mitsuba files: fixed, jitter, orbit, or a JSON file with key frames (default: orbit for "
+        "sequences, jitter otherwise)",
+    )
+    group.add_argument("--frames", type=int, help="frames per sequence, views per still or sample scene")
+    group.add_argument(
+        "--defocus", metavar="P", type=float, help="probability of a lens (default 0.5, sequences 0)"
+    )
+    group.add_argument(
+        "--motion", metavar="P", type=float, help="probability of motion (default 0.5, sequences 0)"
+    )
+    group.add_argument("--test", metavar="SCENE", nargs="*", help="held out for test (default: every eighth)")
+    group.add_argument("--validation", metavar="SCENE", nargs="*", default=(), help="held out for validation")
+
+
+def _image_arguments(group: Any) -> None:
+    group.add_argument("--size", metavar="WxH", help="columns and rows, such as 1280x720")
+    group.add_argument(
+        "--spp", type=int, nargs="+", help="samples per pixel of the noisy images; stills: several"
+    )
+    group.add_argument("--reference-spp", type=int, help="samples per pixel of the reference")
+    group.add_argument("--max-depth", type=int, help="longest path in segments (default 8)")
+    group.add_argument(
+        "--memory", metavar="GB", type=float, help="of each process; fewer samples are traced at once"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render, or print what would be; returns 0, or 1 where a noisy mean is not that of its reference.
+
+    Raises:
+        ValueError: Options that do not fit, Mitsuba is not installed, or a scene cannot be rendered.
+        OSError: The output cannot be written.
+    """
+    from data.render.rendering import RenderOptions, render
+    from data.render.variant import choose
+    from trainer.progress import sample_progress
+
+    recipe = _recipe(args)
+    sources = _sources(args, recipe)
+    variant = choose(None if args.variant == "auto" else args.variant)
+    print(variant.reason)
+    cores = len(os.sched_getaffinity(0))
+    processes = args.processes or max(1, cores // 2)
+    if processes < 1:
+        raise ValueError(f"--processes {args.processes}: expected at least 1")
+    if args.dry_run:
+        return _dry_run(args, recipe, sources, variant, processes)
+    options = RenderOptions(
+        variant,
+        processes,
+        max(1, cores // processes),
+        None if args.test is None else tuple(args.test),
+        tuple(args.validation),
+        args.force,
+    )
+    with sample_progress("rendering") as progress:
+        manifest = render(sources, recipe, args.output, options, progress)
+    return _summary(args.output, manifest)
+
+
+def _recipe(args: argparse.Namespace) -> Recipe:
+    from data.render.recipe import defaults, with_options
+
+    width = height = None
+    if args.size:
+        try:
+            width, height = (int(n) for n in args.size.lower().split("x"))
+        except ValueError:
+            raise ValueError(f"--size {args.size}: expected columns x rows, such as 1280x720") from None
+    chunk = None
+    if args.memory is not None:
+        if not args.memory >= 0.5:
+            raise ValueError(f"--memory {args.memory}: expected at least 0.5 GB for each process")
+        chunk = 2 ** int(max(14, min(22, 20 + _log2(args.memory / 2))))
+    spp = None if args.spp is None else tuple(args.spp)
+    return with_options(
+        defaults(args.kind),
+        width=width,
+        height=height,
+        spp=spp,
+        reference_spp=args.reference_spp,
+        max_depth=args.max_depth,
+        chunk=chunk,
+    )
+
+
+def _log2(number: float) -> float:
+    import math
+
+    return math.floor(math.log2(number))
+
+
+def _sources(args: argparse.Namespace, recipe: Recipe) -> list[Source]:
+    from data.render.assets import Assets
+    from data.render.sources import FileSource, RandomSource
+    from data.render.spec import Shot
+
+    path = args.kind == "sequences"
+    moving = 0.0 if path else 0.5
+    frames = args.frames if args.frames is not None else (8 if path else 1)
+    for name, value in (("defocus", args.defocus), ("motion", args.motion)):
+        if value is not None and not 0 <= value <= 1:
+            raise ValueError(f"--{name} {value}: expected a probability from 0 to 1")
+    if frames < 1 or args.random < 0:
+        raise ValueError(f"--frames {frames}, --random {args.random}: expected at least 1 and 0")
+    shot = Shot(
+        recipe.width,
+        recipe.height,
+        frames,
+        path,
+        moving if args.defocus is None else args.defocus,
+        moving if args.motion is None else args.motion,
+    )
+    given = (args.meshes, args.textures, args.environments)
+    assets = Assets.scan(*given) if any(given) else None
+    random: list[Source] = [
+        RandomSource(args.seed + i, args.places[i % len(args.places)], shot, assets)
+        for i in range(args.random)
+    ]
+    files = [FileSource(path, shot, _camera(args), args.seed) for path in args.scene]
+    return [*random, *files]
+
+
+def _camera(args: argparse.Namespace) -> Any:
+    from data.render.user_scenes import CameraMove
+
+    kind = args.camera
+    if kind == "auto":
+        kind = "orbit" if args.kind == "sequences" else "jitter"
+    if kind in ("fixed", "jitter", "orbit"):
+        return CameraMove(kind)
+    return CameraMove("keyframes", path=Path(kind))
+
+
+def _dry_run(
+    args: argparse.Namespace, recipe: Recipe, sources: Sequence[Source], variant: Variant, processes: int
+) -> int:
+    from data.render.rendering import bytes_of, plan, remembered_speed
+
+    todo = plan(sources, recipe, args.output)
+    views = sum(map(len, todo.works.values()))
+    frames = views * len(recipe.spp)
+    print(
+        f"{len(sources)} scenes, {views} views, {frames} frames of {recipe.width}x{recipe.height}; "
+        f"{'/'.join(map(str, recipe.spp))} spp, reference {recipe.reference_spp} spp"
+    )
+    for name, works in todo.works.items():
+        print(f"  {name}: {len(works)} view{'s' if len(works) > 1 else ''}")
+    print(
+        f"{todo.samples / 1e6:,.1f} million samples, of which {todo.missing / 1e6:,.1f} million are missing; "
+        f"about {bytes_of(recipe, views) / 1e6:,.0f} MB"
+    )
+    if not todo.missing:
+        return 0
+    speed, source = remembered_speed(args.output), "the last call"
+    if speed is None:
+        print(f"measuring the speed on {sources[0].name} …", flush=True)
+        speed, source = _measured(sources[0], recipe, variant, processes), "one scene"
+    print(
+        f"about {_duration(todo.missing / speed)} at {speed / 1e6:.2f} million samples per second ({source})"
+    )
+    return 0
+
+
+def _measured(source: Source, recipe: Recipe, variant: Variant, processes: int) -> float:
+    from data.render.rendering import measure_speed
+
+    threads = max(1, len(os.sched_getaffinity(0)) // processes)
+    return processes * measure_speed(source, recipe, variant, threads)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} seconds"
+    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+
+
+def _summary(output: Path, manifest: Any) -> int:
+    """Print what was made, and which frames need attention."""
+    from data.render.references import ENERGY_LIMIT
+
+    records = [(n, r) for n, s in manifest.scenes.items() for r in s.frames]
+    far = [(n, r) for n, r in records if abs(r.checks["energy_z"]) > ENERGY_LIMIT]
+    size = sum(r.bytes for _, r in records)
+    noise = max(r.checks["reference_relmse"] for _, r in records)
+    largest = max(abs(r.checks["energy_z"]) for _, r in records)
+    print(
+        f"{output}: {len(records)} frames of {len(manifest.scenes)} scenes, {size / 1e6:.0f} MB\n"
+        f"largest difference between the means of a noisy frame and its reference: {largest:.1f} standard "
+        f"errors (limit {ENERGY_LIMIT:g}); relMSE of the noisiest reference itself: {noise:.2g}"
+    )
+    for name, record in far:
+        print(
+            f"warning: {name}/frame {record.index}: the noisy mean is {record.checks['energy_z']:.1f} "
+            "standard errors from its reference's: rare bright paths (a higher --reference-spp shows), or a "
+            "defect"
+        )
+    print(f"next: trainer inspect {output} --html report.html; trainer prepare {output} --output SHARDS")
+    return 1 if far else 0

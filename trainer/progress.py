@@ -1,0 +1,79 @@
+"""Progress of work that is counted in samples: a bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from data.shards.progress import duration
+
+INTERVAL = 15.0
+"""Seconds between plain lines."""
+
+
+class SampleRate:
+    """Describes progress as millions of samples, their rate, and the time left.
+
+    What was done before the first call does not count for the rate.
+    """
+
+    def __init__(self) -> None:
+        self._start: tuple[float, int] | None = None
+
+    def text(self, done: int, total: int) -> str:
+        """Return `12.3/80.0 M samples, 0.35 M/s, 3:13 left`."""
+        now = time.monotonic()
+        if self._start is None:
+            self._start = (now, done)
+        begun, before = self._start
+        rate = (done - before) / (now - begun) if now > begun else 0.0
+        text = f"{done / 1e6:.1f}/{total / 1e6:.1f} M samples"
+        if rate > 0:
+            text += f", {rate / 1e6:.3g} M/s"
+            if done < total:
+                text += f", {duration((total - done) / rate)} left"
+        return text
+
+
+@contextmanager
+def sample_progress(title: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Yield a callback for samples done, samples in all and a label.
+
+    Args:
+        title: Beginning of the line.
+    """
+    rate = SampleRate()
+    if not sys.stderr.isatty():
+        yield _lines(title, rate)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        TextColumn("{task.fields[text]}"),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", text="")
+
+        def update(done: int, total: int, label: str) -> None:
+            bar.update(task, completed=done, total=total, text=rate.text(done, total), description=label)
+
+        yield update
+
+
+def _lines(title: str, rate: SampleRate) -> Callable[[int, int, str], None]:
+    last = [-INTERVAL]
+
+    def update(done: int, total: int, label: str) -> None:
+        text = rate.text(done, total)
+        now = time.monotonic()
+        if now - last[0] >= INTERVAL or done == total:
+            last[0] = now
+            print(f"{title}: {text} ({label})", file=sys.stderr, flush=True)
+
+    return update
