@@ -24,6 +24,7 @@ from data.statistics import Histogram, Pair, near_duplicates
 from trainer.outputs import refuse_existing, replacing
 from trainer.reports.findings import ENERGY_Z, FIREFLIES, Finding, findings
 from trainer.reports.frame_facts import MAIN, FrameFacts, FrameJob, Pictures, look_at, one_thread
+from trainer.reports.pictures import colors
 from trainer.reports.svg import histogram_svg, outside_text, percent, split_svg
 
 Progress = Callable[[int, int, str], None]
@@ -58,6 +59,7 @@ class SceneView:
         problems: Why others could not.
         columns: Frames of the shown view with different numbers of samples, fewest first.
         strip: Frames in a row.
+        views: Number of frames that the row is chosen from.
         motion: The frame that shows the motion, where it is another one.
         histograms: Title, drawing, its legend, and what it does not show.
     """
@@ -71,6 +73,7 @@ class SceneView:
     problems: list[str] = field(default_factory=list)
     columns: list[FrameFacts] = field(default_factory=list)
     strip: list[FrameFacts] = field(default_factory=list)
+    views: int = 1
     motion: FrameFacts | None = None
     histograms: list[dict[str, Any]] = field(default_factory=list)
 
@@ -186,14 +189,19 @@ def column_frames(scene: SceneRecord) -> list[FrameRecord]:
     return sorted(same, key=lambda f: (f.spp or 0, f.index)) if len(same) > 1 else []
 
 
-def strip_frames(scene: SceneRecord) -> list[FrameRecord]:
-    """Return frames for a row: one of each view, at most `STRIP`, evenly spread."""
+def view_frames(scene: SceneRecord) -> list[FrameRecord]:
+    """Return one frame of each view, that with the most samples per pixel."""
     views: dict[int, FrameRecord] = {}
     for f in scene.frames:
         key = f.index if f.view is None else f.view
         if key not in views or (f.spp or 0) > (views[key].spp or 0):
             views[key] = f
-    every = list(views.values())
+    return list(views.values())
+
+
+def strip_frames(scene: SceneRecord) -> list[FrameRecord]:
+    """Return frames for a row: at most `STRIP` of `view_frames`, evenly spread; none where there is one."""
+    every = view_frames(scene)
     if len(every) < 2:
         return []
     places = np.linspace(0, len(every) - 1, min(STRIP, len(every))).round().astype(int)
@@ -236,7 +244,13 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "percent": _percent, "json": _json, "mega": _mega}
+    environment.filters |= {
+        "number": number,
+        "fixed": fixed,
+        "percent": _percent,
+        "json": _json,
+        "mega": _mega,
+    }
     manifest = frames.manifest
     scenes = [_scene_view(manifest, name, [f for f in facts if f.scene == name]) for name in manifest.scenes]
     return environment.get_template("data_report.html.j2").render(
@@ -246,6 +260,8 @@ def render(
         anchors={s.name: s.anchor for s in scenes},
         findings=found,
         noise=noise_rows(scenes),
+        own=any("reference_relmse" in f.record.checks for f in facts),
+        heat=heat_css(),
         splits=split_rows(manifest),
         split_bar=split_svg({s: _frame_count(manifest, s) for s in SPLITS if manifest.splits.get(s)}),
         pairs=pair_rows(manifest, facts, pairs),
@@ -267,6 +283,7 @@ def _scene_view(manifest: Manifest, name: str, facts: list[FrameFacts]) -> Scene
     view.shown = by_index.get(shown_frame(record).index)
     columns = column_frames(record) or [shown_frame(record)]
     view.columns = [by_index[r.index] for r in columns if r.index in by_index and by_index[r.index].columns]
+    view.views = len(view_frames(record))
     view.strip = [by_index[r.index] for r in strip_frames(record) if r.index in by_index]
     view.motion = next((f for f in good if f is not view.shown and "motion" in f.thumbnails), None)
     view.histograms = _histogram_rows(good)
@@ -281,8 +298,8 @@ def _histogram_rows(facts: Sequence[FrameFacts]) -> list[dict[str, Any]]:
     groups = {
         "Luminance, logarithmic": ("color", "reference"),
         "Depth, logarithmic": ("depth",),
-        "Albedo": ("albedo", "diffuse_albedo", "specular_albedo"),
-        "Length of normals": ("normal",),
+        "Albedo (height: square root)": ("albedo", "diffuse_albedo", "specular_albedo"),
+        "Length of normals (height: square root)": ("normal",),
     }
     rows = []
     for title, names in groups.items():
@@ -396,6 +413,19 @@ def number(value: float | None, digits: int = 3) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     return f"{value:.{digits}g}".replace("-", "−", 1) if value < 0 else f"{value:.{digits}g}"
+
+
+def fixed(value: float | None, digits: int) -> str:
+    """Return a number with so many decimals, – where there is none."""
+    if value is None or not math.isfinite(value):
+        return number(value)
+    return f"{value:.{digits}f}".replace("-", "−")
+
+
+def heat_css() -> str:
+    """Return the colours of the density maps as a CSS gradient."""
+    chosen = colors()[np.linspace(40, 255, 12).astype(int)]
+    return "linear-gradient(90deg, " + ", ".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in chosen) + ")"
 
 
 def _percent(share: float | None) -> str:

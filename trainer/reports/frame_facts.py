@@ -16,9 +16,11 @@ from data.derive import derive
 from data.exr import RadianceWarning, looks_encoded
 from data.frame import Frame
 from data.frames import FrameSet
+from data.importance import CANDIDATES, importance_map, importance_positions
 from data.inspection import describe_frame
 from data.manifest import MANIFEST, FrameRecord
-from data.patches import uniform_positions
+from data.patches import patch_count, uniform_positions
+from data.shards.cut import PrepareOptions
 from data.statistics import (
     Fingerprint,
     Histogram,
@@ -29,15 +31,17 @@ from data.statistics import (
     no_hit_share,
     outside_share,
 )
+from trainer.reports.svg import percent
 from trainer.reports.thumbnails import (
     Array,
     Thumbnail,
     buffer_thumbnail,
-    coverage,
     density_picture,
+    expected_coverage,
     picture_of,
     thumbnail,
     window,
+    with_dots,
 )
 
 Pictures = Literal["all", "main", "none"]
@@ -47,12 +51,6 @@ MAIN = ("color", "reference", "albedo", "diffuse_albedo", "normal", "depth")
 
 SMALL = 144
 """Largest side of a picture in a row of frames."""
-
-PATCH = 128
-"""Patch size of `trainer prepare`."""
-
-DRAWS = 4000
-"""Uniform patches that a density map shows; enough that what remains uneven is the frame's border."""
 
 CONSTANT = ("albedo", "diffuse_albedo", "normal", "depth", "position", "color", "reference")
 """Buffers that say nothing if all pixels are equal."""
@@ -266,26 +264,42 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def densities(frame: Frame, color: Array, limit: int) -> tuple[int, dict[str, Thumbnail]]:
-    """Return the patch size, and for each way to choose patches where they fall, on one scale.
+    """Return the patch size, and for uniform and importance sampling where patches fall, on one scale.
 
-    Frames that are smaller than a patch are shown with patches of half their shorter side.
+    The density is the expected one; dots are the centres of the patches of one draw as large as that of
+    `trainer prepare`. Frames that are smaller than a patch are shown with patches of half their shorter side.
 
     Args:
         frame: The frame.
-        color: What to draw over (H, W, 3).
+        color: What to draw over, and what importance is computed from (H, W, 3).
         limit: Largest side of a picture.
     """
     size = (frame.width, frame.height)
-    patch = PATCH if min(size) >= PATCH else max(1, min(size) // 2)
-    seed = ("report", frame.scene, frame.index)
-    chosen = {"uniform": uniform_positions(DRAWS, size, patch, seed, frame.label)}
-    shares = {
-        n: coverage(positions, size, patch) / np.float32(len(positions)) for n, positions in chosen.items()
+    options = PrepareOptions()
+    patch = options.patch_size if min(size) >= options.patch_size else max(1, min(size) // 2)
+    worth = importance_map(color, frame.buffers.get("normal"), patch)
+    seed = (options.seed, "train", frame.scene, frame.index)
+    uniform = patch_count(options.train_patches, *size, 0)
+    candidates = patch_count(CANDIDATES, *size, 0)
+    drawn = {
+        "uniform": uniform_positions(uniform, size, patch, seed, frame.label),
+        "importance": importance_positions(worth, candidates, patch, seed, frame.label),
     }
+    corners = (frame.height - patch + 1, frame.width - patch + 1)
+    middle = patch // 2
+    weights = {
+        "uniform": np.ones(corners, np.float32),
+        "importance": worth[middle : middle + corners[0], middle : middle + corners[1]],
+    }
+    shares = {name: expected_coverage(w, patch) for name, w in weights.items()}
     highest = max(float(share.max()) for share in shares.values())
     found = {}
     for name, share in shares.items():
-        picture = density_picture(color, frame.exposure or 1.0, share, highest)
-        note = f"a pixel is in {100 * float(share.min()):.2g} to {100 * float(share.max()):.2g} % of them"
-        found[name] = thumbnail(picture, limit, note, flat=True)
+        picture = density_picture(color, frame.exposure or 1.0, share / highest, limit)
+        centres = [((x + patch / 2) / size[0], (y + patch / 2) / size[1]) for x, y in drawn[name]]
+        note = (
+            f"{len(centres)} patches of this frame; on average a pixel is in {percent(float(share.min()))} to "
+            f"{percent(float(share.max()))} of them"
+        )
+        found[name] = thumbnail(with_dots(picture, centres), limit, note, flat=True)
     return patch, found

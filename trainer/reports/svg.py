@@ -31,6 +31,9 @@ def histogram_svg(series: Mapping[str, Histogram], label: str) -> Markup:
     parts.append(_axis(scale, first, last))
     for number, h in enumerate(shown.values()):
         shares = h.counts[first:last] / h.total / highest
+        if not scale.logarithmic:
+            # Most albedos and lengths are 0 or 1; the root shows the others beside these peaks.
+            shares = shares**0.5
         path = _steps(shares.tolist(), closed=number == 0)
         parts.append(Markup('<path class="series s{}" d="{}"/>').format(number, path))
     return Markup("").join([*parts, Markup("</svg>")])
@@ -48,8 +51,10 @@ def outside_text(histogram: Histogram) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share as percent with two significant digits: 0 %, 0.012 %, 3.4 %, 57 %."""
+    """Return a share as percent with two significant digits: 0 %, < 0.001 %, 0.012 %, 3.4 %, 57 %."""
     value = 100 * share
+    if 0 < value < 0.001:
+        return "< 0.001 %"
     if value == 0 or abs(value) >= 9.95:
         return f"{value:.0f} %"
     return f"{value:.1f} %" if abs(value) >= 0.95 else f"{value:.2g} %"

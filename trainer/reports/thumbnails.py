@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from data.buffers import buffer
-from data.patches import Position
 from trainer.reports.pictures import colors, false_color, tone_map
 
 Array = NDArray[np.float32]
@@ -48,10 +48,7 @@ def thumbnail(picture: Image.Image, limit: int, note: str = "", *, flat: bool = 
         note: Line below it.
         flat: The colours mean something, so JPEG must keep their resolution.
     """
-    factor = min(1.0, limit / max(picture.size))
-    if factor < 1:
-        size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
-        picture = picture.resize(size, Image.Resampling.BOX, reducing_gap=None)
+    picture = reduced(picture, limit)
     options: dict[str, dict[str, Any]] = {
         "JPEG": {"quality": QUALITY, "subsampling": 0 if flat else 2},
         "PNG": {"optimize": True},
@@ -64,6 +61,15 @@ def thumbnail(picture: Image.Image, limit: int, note: str = "", *, flat: bool = 
     kind = min(coded, key=lambda k: len(coded[k]))
     text = base64.b64encode(coded[kind]).decode()
     return Thumbnail(f"data:image/{kind.lower()};base64,{text}", picture.width, picture.height, note)
+
+
+def reduced(picture: Image.Image, limit: int) -> Image.Image:
+    """Return a picture of at most `limit` columns and rows, the same where it is that small."""
+    factor = limit / max(picture.size)
+    if factor >= 1:
+        return picture
+    size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
+    return picture.resize(size, Image.Resampling.BOX)
 
 
 def buffer_thumbnail(name: str, image: Array, exposure: float, limit: int) -> Thumbnail:
@@ -88,7 +94,7 @@ def picture_of(name: str, image: Array, exposure: float) -> tuple[Image.Image, s
     entry = buffer(name)
     image = np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0)
     if entry.kind == "radiance":
-        return tone_map(image, exposure), f"× {exposure:.3g}"
+        return tone_map(image, exposure), f"exposure {exposure:.3g}"
     if entry.kind == "ratio" and entry.channels == 3:
         return tone_map(image), "0 to 1"
     if name.startswith("normal") and entry.kind == "vector":
@@ -168,36 +174,43 @@ def window(image: Array, side: int) -> Array:
     return image[y : y + side, x : x + side]
 
 
-def coverage(positions: list[Position], size: tuple[int, int], patch: int) -> Array:
-    """Return how many patches cover each pixel, (H, W).
+def expected_coverage(weights: Array, patch: int) -> Array:
+    """Return which share of the patches covers each pixel, (H, W) = (rows + patch - 1, columns + patch - 1).
 
     Args:
-        positions: Top left pixels of the patches.
-        size: Width and height of the frame.
+        weights: How often a patch has its top left pixel here (rows, columns), on any scale.
         patch: Width and height of a patch.
     """
-    width, height = size
-    corners = np.zeros((height + 1, width + 1), np.float32)
-    for x, y in positions:
-        left, top = min(max(x, 0), width), min(max(y, 0), height)
-        right, bottom = min(max(x + patch, 0), width), min(max(y + patch, 0), height)
-        corners[top, left] += 1
-        corners[bottom, right] += 1
-        corners[top, right] -= 1
-        corners[bottom, left] -= 1
-    return corners.cumsum(0).cumsum(1)[:height, :width]
+    rows, columns = weights.shape
+    total = float(weights.sum(dtype=np.float64))
+    chance = weights / total if total > 0 else np.full(weights.shape, 1 / weights.size)
+    edges = np.zeros((rows + patch, columns + patch))
+    edges[:rows, :columns] += chance
+    edges[patch:, patch:] += chance
+    edges[:rows, patch:] -= chance
+    edges[patch:, :columns] -= chance
+    covered = edges.cumsum(0).cumsum(1)[:-1, :-1]
+    return np.clip(covered, 0, 1).astype(np.float32)
 
 
-def density_picture(color: Array, exposure: float, values: Array, highest: float) -> Image.Image:
-    """Return a frame in grey under the false colours of a density.
+def density_picture(color: Array, exposure: float, share: Array, limit: int) -> Image.Image:
+    """Return a frame in grey under the false colours of a density, with at most `limit` columns and rows.
 
     Args:
         color: Radiance (H, W, 3).
         exposure: Factor to a displayable level.
-        values: Density (H, W), from 0.
-        highest: Density of the brightest colour.
+        share: Density (H, W) from 0 to 1, the brightest colour.
+        limit: Largest side.
     """
     grey = np.asarray(tone_map(color, exposure).convert("L"), np.float32)[..., None]
-    share = np.clip(values / max(highest, 1e-12), 0, 1)
-    painted = colors()[np.rint(40 + 215 * share).astype(np.intp)].astype(np.float32)
-    return Image.fromarray(np.rint(0.4 * grey + 0.6 * painted).astype(np.uint8))
+    painted = colors()[np.rint(40 + 215 * np.clip(share, 0, 1)).astype(np.intp)].astype(np.float32)
+    return reduced(Image.fromarray(np.rint(0.4 * grey + 0.6 * painted).astype(np.uint8)), limit)
+
+
+def with_dots(picture: Image.Image, places: Iterable[tuple[float, float]]) -> Image.Image:
+    """Return the picture with dots at places, given as shares of its width and height."""
+    picture = picture.copy()
+    draw = ImageDraw.Draw(picture)
+    for x, y in places:
+        draw.circle((x * picture.width, y * picture.height), 2.5, (255, 255, 255), (0, 0, 0))
+    return picture
