@@ -194,7 +194,7 @@ def test_a_wrong_root_names_the_layout_that_it_looks_like(penumbra, bmfr, tmp_pa
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--layout", "kpcn"], "unknown layout 'kpcn'; known: bmfr, penumbra"),
+        (["--layout", "exrs"], "unknown layout 'exrs'; known: acfm, afgsa"),
         (["--layout", "bmfr", "--test", "attic"], "there is no scene 'attic' to hold out; scenes: classroom"),
         (["--layout", "bmfr", "--buffers", "colour"], "unknown buffer 'colour'"),
         (
@@ -292,3 +292,16 @@ def test_limits_of_the_camera_file_reach_the_manifest(bmfr, tmp_path):
         "position_limit_squared": 0.5,
         "normal_limit_squared": 2.0,
     }
+
+
+def test_the_layout_is_recognised_where_none_is_named(penumbra, tmp_path, capsys):
+    assert call(penumbra, "--output", tmp_path / "set", "--processes", 1) == 0
+    assert FrameSet(tmp_path / "set").manifest.layout == "penumbra"
+    assert "layout penumbra" in capsys.readouterr().out
+
+
+def test_a_folder_that_resembles_no_layout_is_refused_with_the_layouts(tmp_path):
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "notes.txt").write_text("nothing")
+    with pytest.raises(ValueError, match=r"resembles none of the layouts .*oidn.*--layout"):
+        call(tmp_path / "x", "--output", tmp_path / "set")

@@ -15,14 +15,19 @@ if TYPE_CHECKING:
 
 HELP = "read a published or rendered data set into frames and a manifest"
 
+KNOWN = (
+    "bmfr (BMFR, WSKP), nbgd, acfm, afgsa, kpcn, tungsten, oidn, sbmc, layerdenoise, blender, mitsuba, "
+    "penumbra"
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options."""
     parser.add_argument("root", type=Path, metavar="ROOT", help="folder of the source")
     parser.add_argument(
         "--layout",
-        required=True,
-        help="how the source is arranged: bmfr (BMFR and WSKP data sets) or penumbra (Penumbra's renders)",
+        default="auto",
+        help=f"how the source is arranged: {', '.join(KNOWN)}; default: the one that it resembles most",
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument(
@@ -64,10 +69,30 @@ def run(args: argparse.Namespace) -> int:
         force=args.force,
         processes=args.processes or default_processes(),
     )
+    name = args.layout if args.layout != "auto" else _resembled(args.root)
     with showing("frames") as progress:
-        manifest = ingest(args.layout, args.root, args.output, options, progress)
+        manifest = ingest(name, args.root, args.output, options, progress)
     report(manifest, args.output)
     return 0
+
+
+def _resembled(root: Path) -> str:
+    """Return the layout that a folder resembles most, and say so.
+
+    Raises:
+        ValueError: It resembles none.
+        OSError: There is no such folder.
+    """
+    from data.layouts import LAYOUTS, likenesses
+    from data.layouts.scene import require_folder
+
+    require_folder(root)
+    scores = likenesses(root)
+    if not scores:
+        raise ValueError(f"{root} resembles none of the layouts {', '.join(LAYOUTS)}; name one with --layout")
+    name, *others = scores
+    print(f"layout {name}" + (f" (less likely: {', '.join(others)})" if others else ""))
+    return name
 
 
 def report(manifest: Manifest, output: Path) -> None:
@@ -77,7 +102,10 @@ def report(manifest: Manifest, output: Path) -> None:
     console = Console()
     console.print(scene_table(manifest))
     stored = dict.fromkeys(b for s in manifest.scenes.values() for f in s.frames for b in f.buffers)
+    apart = dict.fromkeys(n for s in manifest.scenes.values() for f in s.frames for n in f.samples)
     console.print(f"stored: {', '.join(stored)}", highlight=False, soft_wrap=True)
+    if apart:
+        console.print(f"stored per sample: {', '.join(apart)}", highlight=False, soft_wrap=True)
     repaired: Counter[str] = Counter()
     derived: dict[str, str] = {}
     for scene in manifest.scenes.values():
