@@ -18,6 +18,7 @@ TRAINING = {
     "test": "score a checkpoint on the held-out scenes and print the table",
 }
 COMMANDS = {
+    "render": "render a data set with Mitsuba: random scenes, or yours",
     "ingest": "read a published or rendered data set into frames and a manifest",
     "prepare": "cut frames into shards of training patches",
     "inspect": "say what a file, a data set or shards contain",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from data.render.assets import Assets
 from data.render.random_scenes import GENERATOR_VERSION, Kind, random_scene
 from data.render.spec import SceneSpec, Shot
-from data.render.user_scenes import CameraMove, scene_files_hash, user_scene
+
+if TYPE_CHECKING:
+    from data.render.user_scenes import CameraMove
 
 
 class Source(Protocol):
@@ -91,6 +93,8 @@ class FileSource:
 
     def identity(self) -> dict[str, Any]:
         """Return the hash of the file and of those it refers to, shot, move and seed."""
+        from data.render.user_scenes import scene_files_hash
+
         return {
             "files": scene_files_hash(self.path),
             "shot": asdict(self.shot),
@@ -100,4 +104,6 @@ class FileSource:
 
     def build(self) -> SceneSpec:
         """Read the camera and plan its views."""
+        from data.render.user_scenes import user_scene
+
         return user_scene(self.path, self.shot, self.move, self.seed)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from data.render.sources import Source
     from data.render.variant import Variant
 
+VARIANTS = {"auto": None, "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
+
 HELP = "render a data set with Mitsuba: random scenes, or yours"
 
 DESCRIPTION = """\
@@ -36,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _image_arguments(parser.add_argument_group("images"))
     work = parser.add_argument_group("work")
     work.add_argument("--processes", type=int, help="rendering processes (default: one per two cores)")
-    work.add_argument("--variant", choices=("auto", "llvm", "scalar"), default="auto", help="of Mitsuba")
+    work.add_argument("--variant", choices=tuple(VARIANTS), default="auto", help="of Mitsuba")
     work.add_argument(
         "--dry-run", action="store_true", help="print what would be rendered, its size and time"
     )
@@ -101,8 +103,8 @@ def run(args: argparse.Namespace) -> int:
 
     recipe = _recipe(args)
     sources = _sources(args, recipe)
-    variant = choose(None if args.variant == "auto" else args.variant)
-    print(variant.reason)
+    variant = choose(VARIANTS[args.variant])
+    print(f"Mitsuba's variant: {variant.reason}", flush=True)
     cores = len(os.sched_getaffinity(0))
     processes = args.processes or max(1, cores // 2)
     if processes < 1:
