@@ -13,9 +13,9 @@ from data.manifest import load_manifest
 from data.root import SAMPLE, resolve_root
 from data.sample import TRAIN_PATCHES
 from data.shards.batch import Batches, available
-from data.shards.cut import PrepareOptions
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
+from data.shards.options import PrepareOptions
 from data.shards.prepare import cached_path, prepare_cached
 from data.shards.progress import LineProgress
 from data.shards.read import CorruptSampleError, Sample, ShardReader

@@ -1,5 +1,7 @@
 """Where training patches are cut from frames: uniform positions of a fixed density.
 
+Positions that follow what is in the frame are in `data.importance`.
+
 The published protocol [Fan et al. 2021, section 5] takes 80 training and 20 validation patches of 128x128
 from each 1280x720 frame. Other frame sizes keep the number per area; where that is not whole, numbers of
 successive frames differ by one so that their average is exact.
@@ -51,6 +53,26 @@ def patch_count(per_reference: int, width: int, height: int, ordinal: int) -> in
     return max(1, math.floor((ordinal + 1) * density) - math.floor(ordinal * density))
 
 
+def check_size(size: tuple[int, int], patch: int, label: str = "frame") -> None:
+    """Check that a frame of this width and height holds a patch.
+
+    Raises:
+        ValueError: It does not; names frame, size and option.
+    """
+    width, height = size
+    if width < patch or height < patch:
+        raise ValueError(
+            f"{label} is {width}x{height}, smaller than a patch of {patch}x{patch}; "
+            f"use --patch-size {min(width, height)} or less"
+        )
+
+
+def generator_of(seed: tuple[int | str, ...]) -> np.random.Generator:
+    """Return a generator for whatever tells one draw from others, the same on every machine."""
+    words = "\0".join(map(str, seed)).encode()
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(list(words))))
+
+
 def uniform_positions(
     count: int, size: tuple[int, int], patch: int, seed: tuple[int | str, ...], label: str = "frame"
 ) -> list[Position]:
@@ -67,12 +89,8 @@ def uniform_positions(
     Raises:
         ValueError: The frame is smaller than a patch.
     """
+    check_size(size, patch, label)
     width, height = size
-    if width < patch or height < patch:
-        raise ValueError(
-            f"{label} is {width}x{height}, smaller than a patch of {patch}x{patch}; "
-            f"use --patch-size {min(width, height)} or less"
-        )
     return _draw(count, (0, width - patch + 1), (0, height - patch + 1), seed)
 
 
@@ -113,8 +131,7 @@ def cut(image: Image, position: Position, patch: int) -> Image:
 def _draw(
     count: int, columns: tuple[int, int], rows: tuple[int, int], seed: tuple[int | str, ...]
 ) -> list[Position]:
-    words = "\0".join(map(str, seed)).encode()
-    generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence(list(words))))
+    generator = generator_of(seed)
     xs = generator.integers(*columns, size=count)
     ys = generator.integers(*rows, size=count)
     return [Position(int(x), int(y)) for x, y in zip(xs, ys, strict=True)]

@@ -13,6 +13,7 @@ from torch.utils.data import Dataset, get_worker_info
 
 from data.augment import IMAGE_PLANE, UNCHANGED, Augmentation, Change, Turn, reordered, turn_vectors, turned
 from data.buffers import buffer
+from data.shards.planes import SAMPLES
 from data.shards.read import CorruptSampleError, Sample, ShardReader
 
 Batch = dict[str, Any]
@@ -29,21 +30,23 @@ class Packed(NamedTuple):
     """A batch as it travels from a worker: all images in one piece of shared memory.
 
     Attributes:
-        pixels: float32, one after another each buffer's (B, C, H, W).
+        pixels: float32, one after another each buffer's (B, C, H, W), (B, S, C, H, W) of `samples`.
         shapes: Name and shape of each.
         numbers: Exposure, smallest and largest depth of each.
         samples: Scene, frame and key of each.
+        channels: Channels of `samples`, where it is among the buffers.
         corrupt: Samples that were left out, with the reason.
         error: Why there is no batch. Raised in a worker it would arrive as another type, with a traceback for
             its message.
     """
 
     pixels: Tensor
-    shapes: tuple[tuple[str, tuple[int, int, int, int]], ...]
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
     numbers: tuple[tuple[float, float, float], ...]
     samples: tuple[tuple[str, int, str], ...]
     corrupt: tuple[tuple[str, str], ...]
     error: Exception | None = None
+    channels: tuple[str, ...] = ()
 
     def unpack(self) -> Batch:
         """Return the batch: views of `pixels`, frame numbers, scenes, frames, keys."""
@@ -59,6 +62,8 @@ class Packed(NamedTuple):
         batch["scene"] = [scene for scene, _, _ in self.samples]
         batch["frame"] = torch.tensor([frame for _, frame, _ in self.samples], dtype=torch.int64)
         batch["key"] = [key for _, _, key in self.samples]
+        if self.channels:
+            batch["sample_channels"] = list(self.channels)
         return batch
 
 
@@ -89,6 +94,11 @@ class Batches(Dataset[Packed]):
         self.names = tuple(dict.fromkeys(names))
         self.inputs = frozenset(inputs)
         self.augmentation, self.on_corrupt = augmentation, on_corrupt
+        if SAMPLES in self.names and _moves(augmentation):
+            raise ValueError(
+                "samples that are kept apart are not flipped, rotated or permuted yet: use --data.augment "
+                "false, or name the buffers that are read, without `samples`"
+            )
 
     def __len__(self) -> int:
         return len(self.reader)
@@ -112,7 +122,7 @@ class Batches(Dataset[Packed]):
         samples = [self.reader.sample(number) for number in numbers]
         if not samples:
             return _nothing(corrupt)
-        shapes = tuple((name, (len(samples), buffer(name).channels, *_size(samples))) for name in self.names)
+        shapes = tuple((name, (len(samples), *_shape(samples, name))) for name in self.names)
         pixels = _allocate(sum(math.prod(shape) for _, shape in shapes))
         changes = [self._change(order.epoch, number) for number in numbers]
         start = 0
@@ -128,6 +138,7 @@ class Batches(Dataset[Packed]):
             tuple(self._numbers(order.epoch, n, s) for n, s in zip(numbers, samples, strict=True)),
             tuple((sample.scene, sample.frame, sample.key) for sample in samples),
             corrupt,
+            channels=samples[0].sample_channels if SAMPLES in self.names else (),
         )
 
     def _readable(self, numbers: Iterable[int]) -> tuple[list[int], tuple[tuple[str, str], ...]]:
@@ -208,8 +219,23 @@ def available(sample: Sample) -> tuple[str, ...]:
     return tuple(names)
 
 
+def _moves(augmentation: Augmentation | None) -> bool:
+    return augmentation is not None and (augmentation.rule != "none" or augmentation.permute)
+
+
 def _nothing(corrupt: tuple[tuple[str, str], ...] = (), error: Exception | None = None) -> Packed:
     return Packed(torch.empty(0), (), (), (), corrupt, error)
+
+
+def _shape(samples: list[Sample], name: str) -> tuple[int, ...]:
+    if name != SAMPLES:
+        return (buffer(name).channels, *_size(samples))
+    stored = samples[0].buffers.get(SAMPLES)
+    if stored is None:
+        raise ValueError(
+            f"sample {samples[0].key} has no samples of each pixel; prepare frames that keep them"
+        )
+    return (*stored.shape[:2], *_size(samples))
 
 
 def _size(samples: list[Sample]) -> tuple[int, int]:

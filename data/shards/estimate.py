@@ -7,10 +7,12 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from data.buffers import buffer
+from data.buffers import SAMPLE_BUFFERS, buffer, sample_channels
 from data.frames import FrameSet
+from data.importance import PUBLISHED_SHARE
 from data.manifest import FrameRecord
-from data.shards.cut import BUFFERS, PrepareOptions, plan_shards
+from data.shards.division import Candidate, plan_shards
+from data.shards.options import PrepareOptions
 
 _SAMPLE_OVERHEAD = 2400
 """Bytes of a sample beside its arrays: two tar headers, the JSON and padding."""
@@ -21,7 +23,8 @@ class Estimate:
     """What a preparation will give.
 
     Attributes:
-        patches: Training and validation patches; those with a black reference are counted.
+        patches: Training and validation patches; those with a black reference are counted, and of candidates
+            of importance sampling the share that AFGSA kept, which differs from frame to frame.
         frames: Whole frames of the test split.
         bytes: Size of all shards, if every buffer that may be half precision is.
     """
@@ -38,15 +41,16 @@ def estimate(frames: FrameSet, options: PrepareOptions) -> Estimate:
         ValueError: It cannot be cut with these options.
     """
     records = {(s, r.index): r for s in frames.scenes() for r in frames.frames(s)}
-    patches = whole = size = 0
+    whole, patches, size = 0, 0.0, 0.0
     for plan in plan_shards(frames, options):
-        for index, position in plan.samples:
+        for index, place in plan.samples:
             record = records[plan.scene, index]
-            pixels = record.width * record.height if position is None else options.patch_size**2
-            size += pixels * _bytes_per_pixel(record, options) + _SAMPLE_OVERHEAD
-            whole += position is None
-            patches += position is not None
-    return Estimate(patches, whole, size)
+            pixels = record.width * record.height if place is None else options.patch_size**2
+            share = PUBLISHED_SHARE if isinstance(place, Candidate) else 1.0
+            size += share * (pixels * _bytes_per_pixel(record, options) + _SAMPLE_OVERHEAD)
+            whole += place is None
+            patches += 0.0 if place is None else share
+    return Estimate(round(patches), whole, round(size))
 
 
 def announcement(root: Path, output: Path, expected: Estimate) -> str:
@@ -84,5 +88,9 @@ def size_text(number: int) -> str:
 
 def _bytes_per_pixel(record: FrameRecord, options: PrepareOptions) -> int:
     has = {*record.buffers, *record.derived, "history"}
-    names = [name for name in dict.fromkeys((*BUFFERS, *options.buffers)) if name in has]
-    return sum(buffer(name).channels * (2 if buffer(name).half else 4) for name in names)
+    names = [name for name in options.stored if name in has]
+    plain = sum(buffer(name).channels * (2 if buffer(name).half else 4) for name in names)
+    if options.samples == "none" or not record.samples:
+        return plain
+    half = options.samples == "half" or all(SAMPLE_BUFFERS[name].half for name in record.samples)
+    return plain + (record.spp or 1) * len(sample_channels(*record.samples)) * (2 if half else 4)

@@ -30,6 +30,8 @@ class ShardRecord:
 
     Attributes:
         skipped: Planned patches that were left out because their reference is black.
+        pruned: Candidates of importance sampling that were dropped.
+        per_sample: Samples per pixel that are kept apart, and their channels; None where they are not.
     """
 
     file: str
@@ -39,12 +41,16 @@ class ShardRecord:
     bytes: int
     samples: tuple[SampleRecord, ...] = field(repr=False)
     skipped: int = 0
+    pruned: int = 0
+    per_sample: tuple[int, tuple[str, ...]] | None = None
 
     @classmethod
     def from_dict(cls, record: dict[str, Any]) -> ShardRecord:
         """Return the record that `to_dict` wrote."""
         samples = tuple(SampleRecord(**sample) for sample in record["samples"])
-        return cls(**{**record, "samples": samples})
+        kept = record.get("per_sample")
+        per_sample = None if kept is None else (int(kept[0]), tuple(kept[1]))
+        return cls(**{**record, "samples": samples, "per_sample": per_sample})
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -62,6 +68,7 @@ class Index:
         options: Options of the preparation.
         shards: All shards, in the order of split and number.
         skipped: Planned patches that were left out because their reference is black.
+        pruned: Candidates of importance sampling that were dropped.
     """
 
     root: Path
@@ -70,6 +77,7 @@ class Index:
     options: dict[str, Any]
     shards: tuple[ShardRecord, ...]
     skipped: int = 0
+    pruned: int = 0
 
     def of(self, split: str) -> tuple[ShardRecord, ...]:
         """Return the shards of a split."""
@@ -92,6 +100,7 @@ class Index:
             "manifest": self.manifest,
             "options": self.options,
             "skipped": self.skipped,
+            "pruned": self.pruned,
             "shards": [shard.to_dict() for shard in self.shards],
         }
         write_json(self.root / INDEX, record)
@@ -122,6 +131,7 @@ class Index:
                 record["options"],
                 shards,
                 record["skipped"],
+                record.get("pruned", 0),
             )
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(

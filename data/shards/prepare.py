@@ -1,9 +1,9 @@
 """Cuts the frames of a data set into shards: planned beforehand, so that it can stop and go on anywhere.
 
-Which patch goes into which shard follows from the manifest and the options alone. Scenes are independent and
-may be done by several processes; the result does not depend on their number. While it is being made a result
-lies in `OUTPUT.partial`: finished shards below `shards/`, a record of each below `records/`. When all are
-there, the index is written and the folder gets its name.
+Which patch or candidate goes into which shard follows from the manifest and the options alone. Scenes are
+independent and may be done by several processes; the result does not depend on their number. While it is
+being made a result lies in `OUTPUT.partial`: finished shards below `shards/`, a record of each below
+`records/`. When all are there, the index is written and the folder gets its name.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from data.frames import FrameSet
-from data.shards.cut import CUT_VERSION, PrepareOptions, ShardPlan, make_scene, plan_shards
+from data.shards.cut import CUT_VERSION, make_scene
+from data.shards.division import ShardPlan, plan_shards
 from data.shards.estimate import announcement, check_room, estimate
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
+from data.shards.options import PrepareOptions
 from data.shards.processes import in_processes
 
 MANY_FRAMES = 50
@@ -82,10 +84,17 @@ def prepare(
         _open_work(work, identity, force)
         plans = plan_shards(frames, options)
         records = _make_all(frames, work, plans, options, processes, progress or (lambda done, total: None))
-        shards = tuple(record for record in records if record.samples)
+        _check_samples(records)
         manifest = frames.manifest
-        skipped = sum(record.skipped for record in records)
-        Index(work / "shards", manifest.hash, manifest.to_json(), options.to_dict(), shards, skipped).write()
+        Index(
+            work / "shards",
+            manifest.hash,
+            manifest.to_json(),
+            options.to_dict(),
+            shards=tuple(record for record in records if record.samples),
+            skipped=sum(record.skipped for record in records),
+            pruned=sum(record.pruned for record in records),
+        ).write()
         _publish(work, output)
         return Index.read(output)
 
@@ -159,6 +168,31 @@ def _make_all(
         for job in jobs:
             make_scene(*job, report=report)
     return [_record(work, plan.file) for plan in plans]
+
+
+def _check_samples(records: list[ShardRecord]) -> None:
+    """Check that all shards keep the same samples apart, which the manifest alone need not tell.
+
+    Raises:
+        ValueError: They do not.
+    """
+    kinds = {record.per_sample: record for record in reversed(records) if record.samples}
+    if len(kinds) > 1:
+        told = [
+            f"{record.scene} ({record.split}) has {_kind_text(kind)}"
+            for kind, record in list(kinds.items())[:2]
+        ]
+        raise ValueError(
+            f"frames that keep different samples apart cannot be in one set of shards: {' and '.join(told)}; "
+            "choose frames with --spp N, or leave samples out with --samples none"
+        )
+
+
+def _kind_text(kind: tuple[int, tuple[str, ...]] | None) -> str:
+    if kind is None:
+        return "none"
+    count, channels = kind
+    return f"{count} of {', '.join(dict.fromkeys(channel.partition('.')[0] for channel in channels))}"
 
 
 def _record(work: Path, file: str) -> ShardRecord:

@@ -15,19 +15,24 @@ def duration(seconds: float) -> str:
 
 
 class Rate:
-    """Samples per second and time left since the first call; samples of an earlier run do not count."""
+    """Samples per second and time left since the first call; samples of an earlier run do not count.
 
-    def __init__(self) -> None:
+    Args:
+        unit: What is counted.
+    """
+
+    def __init__(self, unit: str = "samples") -> None:
+        self.unit = unit
         self._start: tuple[float, int] | None = None
 
     def text(self, done: int, total: int) -> str:
-        """Return `12/80 patches, 34.5/s, 0:02 left`."""
+        """Return `12/80 samples, 34.5/s, 0:02 left`."""
         now = time.monotonic()
         if self._start is None:
             self._start = (now, done)
         begun, before = self._start
         rate = (done - before) / (now - begun) if now > begun else 0.0
-        text = f"{done}/{total} samples"
+        text = f"{done}/{total} {self.unit}"
         if rate > 0 and done < total:
             text += f", {rate:.1f}/s, {duration((total - done) / rate)} left"
         return text
@@ -39,11 +44,12 @@ class LineProgress:
     Args:
         title: Beginning of each line.
         interval: Seconds between lines.
+        unit: What is counted.
     """
 
-    def __init__(self, title: str, interval: float = 10.0) -> None:
+    def __init__(self, title: str, interval: float = 10.0, unit: str = "samples") -> None:
         self.title, self.interval = title, interval
-        self._rate = Rate()
+        self._rate = Rate(unit)
         self._last: float | None = None
 
     def __call__(self, done: int, total: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import tarfile
@@ -44,11 +45,11 @@ Mapped = tuple[mmap.mmap, dict[torch.dtype, Tensor]]
 
 
 class Stored(NamedTuple):
-    """Where an array of a sample lies in its shard: type, shape (C, H, W), first value counted in that
-    type."""
+    """Where an array of a sample lies in its shard: type, shape, (C, H, W) or (S, C, H, W), and first value
+    counted in that type."""
 
     dtype: torch.dtype
-    shape: tuple[int, int, int]
+    shape: tuple[int, ...]
     start: int
 
 
@@ -65,6 +66,7 @@ class Sample(NamedTuple):
     width: int
     shard: int
     buffers: dict[str, Stored]
+    sample_channels: tuple[str, ...] = ()
 
 
 class ShardReader:
@@ -132,7 +134,7 @@ class ShardReader:
         return known
 
     def array(self, number: int, name: str) -> Tensor:
-        """Return a stored array (C, H, W) as it is, a read-only view of the mapped file.
+        """Return a stored array (C, H, W), `samples` (S, C, H, W), a read-only view of the mapped file.
 
         Raises:
             ValueError: The sample has no such buffer; the message lists what it has.
@@ -147,8 +149,8 @@ class ShardReader:
                 f"trainer prepare FRAMES --output SHARDS --buffers {name},…"
             )
         _, views = self._map(number, sample.shard)
-        _, height, width = stored.shape
-        return views[stored.dtype].as_strided(stored.shape, (height * width, width, 1), stored.start)
+        strides = [math.prod(stored.shape[i + 1 :]) for i in range(len(stored.shape))]
+        return views[stored.dtype].as_strided(stored.shape, strides, stored.start)
 
     def _read(self, number: int, shard: int, place: int) -> Sample:
         record = self.shards[shard].samples[place]
@@ -200,10 +202,9 @@ def _parse(key: str, raw: memoryview, offset: int, shard: int) -> Sample:
     start = offset + 2 * block + length + -length % block
     buffers = {}
     for entry in meta["buffers"]:
-        channels, height, width = entry["shape"]
         dtype = DTYPES[entry["dtype"]]
         first = (start + entry["offset"]) // dtype.itemsize
-        buffers[entry["name"]] = Stored(dtype, (channels, height, width), first)
+        buffers[entry["name"]] = Stored(dtype, tuple(entry["shape"]), first)
     low, high = meta["depth_range"]
     return Sample(
         key,
@@ -216,4 +217,5 @@ def _parse(key: str, raw: memoryview, offset: int, shard: int) -> Sample:
         meta["width"],
         shard,
         buffers,
+        tuple(meta.get("sample_channels", ())),
     )

@@ -15,68 +15,62 @@ from typing import IO, Any
 
 import numpy as np
 
-from data.buffers import buffer
 from data.frame import Image
 from data.shards.index import SampleRecord, ShardRecord
-
-HALF_MAX = 65504.0
-HALF_FLOOR = 2.0**-8
-"""Arrays that are not zero but nowhere exceed this are kept in float32: half precision would have fewer than
-its 11 bits for values 1/64 of the largest and smaller."""
+from data.shards.planes import Planes, Stored
 
 ALIGNMENT = 64
 
 
-def half_fits(name: str, array: Image) -> bool:
-    """Return whether an array of the named buffer is stored in half precision.
-
-    It is if the vocabulary allows it, its largest magnitude is at most 65504, and not so small that the array
-    would lie among the subnormal numbers.
-    """
-    if not buffer(name).half:
-        return False
-    largest = float(np.abs(array).max(initial=0.0))
-    return largest == 0.0 or HALF_FLOOR <= largest <= HALF_MAX
-
-
-def encode(arrays: Mapping[str, Image]) -> tuple[list[dict[str, Any]], bytes]:
-    """Return the description and the bytes of a sample's buffers.
+def describe(arrays: Mapping[str, Stored]) -> tuple[list[dict[str, Any]], int]:
+    """Return the description of a sample's arrays, and the bytes that they take.
 
     Args:
-        arrays: Name → float32 (H, W, C).
+        arrays: Name → float16 or float32, channels before rows and columns.
 
     Returns:
-        A list with name, dtype, shape (C, H, W), offset and size of each, and the concatenated little-endian
-        arrays, each aligned to 64 bytes.
-
-    Raises:
-        ValueError: A value is not finite; names the buffer.
+        A list with name, dtype, shape, offset and size of each; arrays lie one after another, each aligned to
+        64 bytes.
     """
-    described, parts, offset = [], [], 0
+    described, offset = [], 0
     for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(
-                f"buffer {name!r} has values that are not finite; ingest repairs them: trainer ingest"
-            )
-        dtype = "<f2" if half_fits(name, array) else "<f4"
-        payload = np.ascontiguousarray(array.transpose(2, 0, 1).astype(dtype)).tobytes()
-        shape = [array.shape[2], array.shape[0], array.shape[1]]
+        dtype = "<f2" if array.dtype == np.float16 else "<f4"
+        size = array.nbytes
         described.append(
-            {"name": name, "dtype": dtype, "shape": shape, "offset": offset, "bytes": len(payload)}
+            {"name": name, "dtype": dtype, "shape": list(array.shape), "offset": offset, "bytes": size}
         )
-        padding = -len(payload) % ALIGNMENT
-        parts += [payload, bytes(padding)]
-        offset += len(payload) + padding
-    return described, b"".join(parts)
+        offset += size + -size % ALIGNMENT
+    return described, offset
 
 
-def member(name: str, payload: bytes) -> bytes:
-    """Return a tar member: header without time, owner or other traces of the machine, payload, padding."""
+def header(name: str, size: int) -> bytes:
+    """Return the header of a tar member, without time, owner or other traces of the machine."""
     info = tarfile.TarInfo(name)
-    info.size = len(payload)
+    info.size = size
     info.mode = 0o644
-    header = info.tobuf(tarfile.USTAR_FORMAT)
-    return header + payload + bytes(-len(payload) % tarfile.BLOCKSIZE)
+    return info.tobuf(tarfile.USTAR_FORMAT)
+
+
+def record_of(key: str, meta: Mapping[str, Any], arrays: Mapping[str, Stored]) -> bytearray:
+    """Return a sample as the two members of a tar file, `KEY.json` and `KEY.buffers`.
+
+    Args:
+        key: Name of the sample.
+        meta: What its JSON says beside the list of buffers.
+        arrays: As `describe`.
+    """
+    described, size = describe(arrays)
+    text = json.dumps({**meta, "buffers": described}, sort_keys=True).encode()
+    block = tarfile.BLOCKSIZE
+    start = 2 * block + len(text) + -len(text) % block
+    record = bytearray(start + size + -size % block)
+    record[:block] = header(f"{key}.json", len(text))
+    record[block : block + len(text)] = text
+    record[start - block : start] = header(f"{key}.buffers", size)
+    for entry, array in zip(described, arrays.values(), strict=True):
+        place = np.frombuffer(record, entry["dtype"], array.size, start + entry["offset"])
+        place.reshape(array.shape)[...] = array
+    return record
 
 
 class ShardWriter:
@@ -97,7 +91,8 @@ class ShardWriter:
         self.path, self.split, self.scene = path, split, scene
         self.temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
         self.samples: list[SampleRecord] = []
-        self.skipped = 0
+        self.skipped = self.pruned = 0
+        self.per_sample: tuple[int, tuple[str, ...]] | None = None
         self._hash = hashlib.sha256()
         self._offset = 0
         self._file: IO[bytes] | None = None
@@ -114,15 +109,21 @@ class ShardWriter:
         self.temporary.unlink(missing_ok=True)
 
     def add(self, meta: Mapping[str, Any], arrays: Mapping[str, Image]) -> None:
-        """Append a sample; `meta` is what its JSON says beside the list of buffers.
+        """Append a sample of whole images; `add_stored` takes them as they are stored.
+
+        Args:
+            meta: What its JSON says beside the list of buffers.
+            arrays: Name → float32 (H, W, C).
 
         Raises:
             ValueError: A value is not finite.
         """
-        described, payload = encode(arrays)
+        self.add_stored(meta, {name: Planes.of(name, image).cut(None, 0) for name, image in arrays.items()})
+
+    def add_stored(self, meta: Mapping[str, Any], arrays: Mapping[str, Stored]) -> None:
+        """Append a sample whose arrays have the type and order of `data.shards.planes`."""
         key = f"{self.path.stem}-{len(self.samples):05d}"
-        text = json.dumps({**meta, "buffers": described}, sort_keys=True).encode()
-        record = member(f"{key}.json", text) + member(f"{key}.buffers", payload)
+        record = record_of(key, meta, arrays)
         self.samples.append(SampleRecord(key, self._offset, len(record), zlib.crc32(record)))
         self._write(record)
 
@@ -150,9 +151,11 @@ class ShardWriter:
             bytes=self._offset,
             samples=tuple(self.samples),
             skipped=self.skipped,
+            pruned=self.pruned,
+            per_sample=self.per_sample,
         )
 
-    def _write(self, record: bytes) -> None:
+    def _write(self, record: bytes | bytearray) -> None:
         try:
             if self._file is None:
                 self._file = self.temporary.open("wb")

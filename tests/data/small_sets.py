@@ -9,8 +9,8 @@ import numpy as np
 from data.frame import Frame
 from data.ingestion import write_record
 from data.manifest import Manifest, SceneRecord
-from data.shards.cut import PrepareOptions
 from data.shards.index import Index
+from data.shards.options import PrepareOptions
 from data.shards.prepare import prepare
 
 SPLITS = {"train": ["hall", "roof"], "validation": [], "test": ["cave"]}

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.shards.write import ShardWriter, encode, half_fits
+from data.patches import Position, cut
+from data.shards.planes import Planes, half_fits
+from data.shards.write import ShardWriter, record_of
 from tests.data.small_sets import write_shards
 
 META = {"scene": "a", "frame": 0}
@@ -35,8 +37,20 @@ def test_half_precision_only_where_range_and_vocabulary_allow(name: str, value: 
     assert half_fits(name, image(value)) is half
 
 
+def stored(images: dict[str, np.ndarray]) -> tuple[list[dict], bytes]:
+    """Return what a sample's JSON says of its arrays, and their bytes."""
+    record = record_of(
+        "a", META, {name: Planes.of(name, array).cut(None, 0) for name, array in images.items()}
+    )
+    with tarfile.open(fileobj=io.BytesIO(bytes(record))) as tar:
+        json_file, buffers = (tar.extractfile(entry) for entry in tar)
+        assert json_file is not None
+        assert buffers is not None
+        return json.loads(json_file.read())["buffers"], buffers.read()
+
+
 def test_an_array_that_overflows_half_is_stored_in_float32_beside_others_in_half():
-    described, payload = encode({"color": image(1e6), "albedo": image(0.5)})
+    described, payload = stored({"color": image(1e6), "albedo": image(0.5)})
     assert [entry["dtype"] for entry in described] == ["<f4", "<f2"]
     color = np.frombuffer(payload, "<f4", 60, described[0]["offset"])
     assert (color == 1e6).all()
@@ -44,15 +58,46 @@ def test_an_array_that_overflows_half_is_stored_in_float32_beside_others_in_half
 
 def test_arrays_are_channel_first_and_aligned():
     source = np.arange(60, dtype=np.float32).reshape(4, 5, 3)
-    described, payload = encode({"depth": image(2, 1), "normal": source})
+    described, payload = stored({"depth": image(2, 1), "normal": source})
     assert all(entry["offset"] % 64 == 0 for entry in described)
-    stored = np.frombuffer(payload, "<f2", 60, described[1]["offset"]).reshape(3, 4, 5)
-    assert np.array_equal(stored, source.transpose(2, 0, 1))
+    normal = np.frombuffer(payload, "<f2", 60, described[1]["offset"]).reshape(3, 4, 5)
+    assert np.array_equal(normal, source.transpose(2, 0, 1))
 
 
-def test_values_that_are_not_finite_are_refused_by_name():
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_refused_by_name(value: float):
+    spoilt = image(1)
+    spoilt[3, 2, 1] = value
     with pytest.raises(ValueError, match="'albedo' has values that are not finite"):
-        encode({"color": image(1), "albedo": image(np.nan)})
+        stored({"color": image(1), "albedo": spoilt})
+
+
+def test_each_patch_is_stored_as_precisely_as_if_it_were_alone():
+    generator = np.random.default_rng(5)
+    whole = generator.uniform(-1, 1, (24, 24, 3)).astype(np.float32)
+    whole[8:16, 8:16] *= 2.0**-9  # subnormal on its own
+    whole[8, 8] = 0
+    whole[20, 20] = 1e6  # does not fit
+    whole[16:, :8] = 0
+    whole[12, :8] = 0  # a row that says nothing of the others
+    planes = Planes.of("color", whole)
+    types = {}
+    for y in range(0, 24, 8):
+        for x in range(0, 24, 8):
+            piece = np.ascontiguousarray(whole[y : y + 8, x : x + 8])
+            found = planes.cut(Position(x, y), 8)
+            types[x, y] = found.dtype
+            assert (found.dtype == np.float16) is half_fits("color", piece)
+            assert np.array_equal(found, piece.transpose(2, 0, 1).astype(found.dtype))
+    assert [place for place, kind in types.items() if kind == np.float32] == [(8, 8), (16, 16)]
+    assert planes.cut(None, 0).dtype == np.float32
+
+
+def test_patches_are_cut_as_images_are_beyond_the_border_too():
+    whole = np.random.default_rng(5).uniform(0.1, 1, (20, 24, 3)).astype(np.float32)
+    for position in (Position(-5, 3), Position(19, 15), Position(3, -7), Position(-8, -8), Position(4, 2)):
+        expected = cut(whole, position, 8).transpose(2, 0, 1).astype(np.float16)
+        assert np.array_equal(Planes.of("color", whole).cut(position, 8), expected)
 
 
 def test_a_shard_appears_only_when_it_is_finished(tmp_path: Path):

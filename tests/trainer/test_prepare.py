@@ -20,9 +20,11 @@ import pytest
 from data.frames import FrameSet
 from data.patches import REFERENCE_AREA
 from data.shards.batch import Batches, Order
-from data.shards.cut import CUT_VERSION, PrepareOptions, plan_shards
+from data.shards.cut import CUT_VERSION
+from data.shards.division import plan_shards
 from data.shards.estimate import estimate
 from data.shards.index import INDEX, Index
+from data.shards.options import PrepareOptions
 from data.shards.prepare import cached_path, prepare, prepare_cached
 from data.shards.read import ShardReader
 from tests.data.small_sets import OPTIONS, write_set

@@ -7,41 +7,47 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from data.shards.index import Index
+    from data.shards.options import PrepareOptions
     from data.shards.prepare import Progress
 
 HELP = "cut frames into shards of training patches"
 
 
+EPILOG = """\
+recipes, for what the published methods were trained on; other options override them:
+  bmfr    uniform, 80 training and 20 validation patches per 1280x720 frame, accumulated (WSKP); the defaults
+  afgsa   importance sampling of 400 candidates per 1280x720 frame, one view in twenty held out for
+          validation, not accumulated; color, albedo, normal, depth, reference
+  layers  uniform, 56 and 14 patches per 1280x720 frame (training crops cover a frame's area once), not
+          accumulated; the same buffers, and samples in half precision, radiance clipped to [0, 65504]
+
+importance sampling: candidates are thrown over each frame at a distance, then dropped at random, the more the
+less noisy colour and normals vary in the patch; AFGSA kept 258 of 400. Frames without normals are judged by
+colour alone. Numbers per frame keep their density: a frame of half the area gets half of them.
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="DIR", help="ingested frames, or sample:NAME")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    parser.add_argument("source", metavar="DIR", help="ingested or rendered frames, or sample:NAME")
     parser.add_argument("--output", required=True, metavar="SHARDS", type=Path, help="folder to make")
-    parser.add_argument("--patch-size", type=int, default=128, metavar="N", help="pixels (default 128)")
+    parser.add_argument("--recipe", choices=("bmfr", "afgsa", "layers"), help="see below (default: none)")
+    _add_positions(parser)
+    _add_contents(parser)
     parser.add_argument(
-        "--train-patches", type=int, default=80, metavar="N", help="per 1280x720 frame (default 80)"
+        "--samples-per-shard",
+        type=int,
+        metavar="N",
+        help="patches, or candidates, in a shard at most (default 256)",
     )
-    parser.add_argument(
-        "--validation-patches", type=int, default=20, metavar="N", help="per 1280x720 frame (default 20)"
-    )
-    parser.add_argument(
-        "--samples-per-shard", type=int, default=256, metavar="N", help="at most (default 256)"
-    )
-    parser.add_argument(
-        "--buffers", default="", metavar="A,B", help="buffers to keep beside the usual ones, such as motion"
-    )
-    parser.add_argument(
-        "--no-accumulate", action="store_true", help="do not accumulate sequences over preceding frames"
-    )
-    parser.add_argument(
-        "--wskp-legacy-crops",
-        action="store_true",
-        help="crop as the authors' script of WSKP: 77 crops, zero padding, left and top part of the frame",
-    )
-    parser.add_argument("--seed", type=int, default=1, help="seed of the patch positions (default 1)")
     parser.add_argument(
         "--processes",
         type=int,
@@ -52,10 +58,73 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace shards that exist")
 
 
+def _add_positions(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which patches")
+    group.add_argument("--sampling", choices=("uniform", "importance"), help="positions (default uniform)")
+    group.add_argument("--patch-size", type=int, metavar="N", help="pixels (default 128)")
+    group.add_argument(
+        "--train-patches", type=int, metavar="N", help="uniform: per 1280x720 frame (default 80)"
+    )
+    group.add_argument(
+        "--validation-patches",
+        type=int,
+        metavar="N",
+        help="uniform: per 1280x720 frame (default 20); importance, where validation patches come from the "
+        "training frames: candidates in proportion to --train-patches",
+    )
+    group.add_argument(
+        "--candidates", type=int, metavar="N", help="importance: per 1280x720 frame (default 400)"
+    )
+    group.add_argument(
+        "--importance-floor",
+        type=float,
+        metavar="X",
+        help="importance: smallest squared mean that the variance of colour is divided by (default 1e-4; "
+        "1e-2 gives dark regions less weight)",
+    )
+    group.add_argument(
+        "--validation-share",
+        type=float,
+        metavar="X",
+        help="share of the views that is held out for validation, where the frames have no scenes for it "
+        "(default 0: validation patches come from the training frames)",
+    )
+    group.add_argument(
+        "--spp", type=int, nargs="+", metavar="N", help="only frames with these samples per pixel"
+    )
+    group.add_argument(
+        "--wskp-legacy-crops",
+        action="store_true",
+        default=None,
+        help="crop as the authors' script of WSKP: 77 crops, zero padding, left and top part of the frame",
+    )
+    group.add_argument("--seed", type=int, metavar="N", help="seed of the patch positions (default 1)")
+
+
+def _add_contents(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("what is kept of them")
+    group.add_argument(
+        "--buffers", metavar="A,B", help="buffers to keep beside the usual ones, such as motion"
+    )
+    group.add_argument(
+        "--only", metavar="A,B", help="buffers to keep instead of the usual ones, where frames have them"
+    )
+    group.add_argument(
+        "--samples",
+        choices=("auto", "half", "none"),
+        help="samples that frames keep apart: as precise as they are, in half precision, or left out "
+        "(default auto)",
+    )
+    group.add_argument(
+        "--accumulate",
+        action=argparse.BooleanOptionalAction,
+        help="accumulate sequences over preceding frames (default: yes)",
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Prepare, and print what was made."""
     from data.root import resolve_root
-    from data.shards.cut import PrepareOptions
     from data.shards.prepare import prepare
 
     root = resolve_root(args.source)
@@ -63,17 +132,8 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.source} holds shards already; name a folder made by `trainer ingest`")
     if args.processes < 1:
         raise ValueError(f"--processes is {args.processes}; expected at least 1")
-    options = PrepareOptions(
-        patch_size=args.patch_size,
-        train_patches=args.train_patches,
-        validation_patches=args.validation_patches,
-        samples_per_shard=args.samples_per_shard,
-        accumulate=not args.no_accumulate,
-        seed=args.seed,
-        wskp_legacy_crops=args.wskp_legacy_crops,
-        buffers=tuple(name for name in args.buffers.split(",") if name),
-    )
-    with _progress(f"preparing {root.path.name}") as progress:
+    options = _options(args)
+    with _progress(f"preparing {root.path.name}", _unit(options)) as progress:
         index = prepare(
             root.path,
             args.output,
@@ -82,25 +142,59 @@ def run(args: argparse.Namespace) -> int:
             force=args.force,
             progress=progress,
         )
+    _print(args.output, index, options)
+    return 0
+
+
+def _options(args: argparse.Namespace) -> PrepareOptions:
+    from data.shards.options import PrepareOptions, recipe_options
+
+    explicit: dict[str, Any] = {f.name: getattr(args, f.name) for f in fields(PrepareOptions)}
+    for name in ("buffers", "only"):
+        if explicit[name] is not None:
+            explicit[name] = tuple(word for word in explicit[name].split(",") if word)
+    explicit["spp"] = None if args.spp is None else tuple(args.spp)
+    return recipe_options(explicit.pop("recipe"), explicit)
+
+
+def _unit(options: PrepareOptions) -> str:
+    return "candidates" if options.sampling == "importance" else "samples"
+
+
+def _print(output: Path, index: Index, options: PrepareOptions) -> None:
     size = sum(shard.bytes for shard in index.shards) / 1e6
-    print(f"{args.output}: {len(index.shards)} shards, {size:.1f} MB")
+    print(f"{output}: {len(index.shards)} shards, {size:.1f} MB")
     for split in ("train", "validation", "test"):
         kind = "frames" if split == "test" else "patches"
         print(
             f"  {split:<10} {index.count(split):>6} {kind} of {', '.join(index.scenes(split)) or 'no scene'}"
         )
+    if index.shards and index.shards[0].per_sample is not None:
+        count, channels = index.shards[0].per_sample
+        print(f"  {count} samples of {len(channels)} channels per pixel are kept apart")
+    if options.sampling == "importance":
+        judged = index.pruned + index.skipped + index.count("train") + index.count("validation")
+        print(f"  {index.pruned} of {judged} candidates were dropped, where colour and normals vary little")
+        bare = _without_normal(index)
+        if bare:
+            print(f"  {bare} frames have no normal, so colour alone chose their patches")
     if index.skipped:
         print(f"  {index.skipped} patches with a black reference were left out")
-    return 0
+
+
+def _without_normal(index: Index) -> int:
+    scenes = {shard.scene for split in ("train", "validation") for shard in index.of(split)}
+    records = [frame for scene in scenes for frame in index.manifest["scenes"][scene]["frames"]]
+    return sum("normal" not in {*record["buffers"], *record["derived"]} for record in records)
 
 
 @contextmanager
-def _progress(title: str) -> Iterator[Progress]:
+def _progress(title: str, unit: str) -> Iterator[Progress]:
     """Yield a bar on a terminal, and something that prints lines elsewhere."""
     from data.shards.progress import LineProgress, Rate
 
     if not sys.stderr.isatty():
-        yield LineProgress(title)
+        yield LineProgress(title, unit=unit)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -108,5 +202,5 @@ def _progress(title: str) -> Iterator[Progress]:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, text="")
-        rate = Rate()
+        rate = Rate(unit)
         yield lambda done, total: bar.update(task, completed=done, total=total, text=rate.text(done, total))

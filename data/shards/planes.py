@@ -1,0 +1,129 @@
+"""The buffers of a frame as shards hold them: channel first, in half precision where that is enough.
+
+A frame is converted once, and patches are copied out of it; each patch decides for itself whether half
+precision holds it, so that a firefly elsewhere in the frame costs nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from data.buffers import SAMPLE_BUFFERS, buffer
+from data.frame import Image, Samples
+from data.patches import Position
+
+HALF_MAX = 65504.0
+HALF_FLOOR = 2.0**-8
+"""Arrays that are not zero but nowhere exceed this are kept in float32: half precision would have fewer than
+its 11 bits for values 1/64 of the largest and smaller."""
+
+SAMPLES = "samples"
+"""Name under which the samples of each pixel are stored, (S, C, H, W)."""
+
+Stored = NDArray[Any]
+"""float16 or float32, little-endian, channels before rows and columns."""
+
+
+def half_fits(name: str, array: Image) -> bool:
+    """Return whether an array of the named buffer is stored in half precision.
+
+    It is if the vocabulary allows it, its largest magnitude is at most 65504, and not so small that the array
+    would lie among the subnormal numbers.
+    """
+    return buffer(name).half and _in_range(array)
+
+
+class Planes:
+    """One buffer of a frame, ready to be cut.
+
+    Args:
+        name: The buffer, for messages.
+        values: float32 (C, H, W), or (S, C, H, W) of samples.
+        half: Half precision is allowed.
+
+    Raises:
+        ValueError: A value is not finite; names the buffer.
+    """
+
+    def __init__(self, name: str, values: NDArray[np.float32], half: bool) -> None:
+        low, high = float(values.min(initial=0)), float(values.max(initial=0))
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise ValueError(
+                f"buffer {name!r} has values that are not finite; ingest repairs them: trainer ingest"
+            )
+        self.values = values
+        self._all_in_range = max(high, -low) <= HALF_MAX
+        self._half: NDArray[np.float16] | None = None
+        if half:
+            with np.errstate(over="ignore"):  # a patch with such a value is taken from `values`
+                self._half = values.astype("<f2")
+
+    @staticmethod
+    def of(name: str, image: Image) -> Planes:
+        """Return the planes of a buffer (H, W, C)."""
+        return Planes(name, _channel_first(image), buffer(name).half)
+
+    @staticmethod
+    def of_samples(samples: Samples, half: bool) -> Planes:
+        """Return the planes of samples.
+
+        Args:
+            samples: The samples of a frame.
+            half: In half precision whatever they are, radiance clipped to [0, 65504]; otherwise only where it
+                is precise enough for every quantity.
+        """
+        values = np.ascontiguousarray(samples.values.transpose(0, 3, 1, 2))
+        if half and "radiance" in samples.names:
+            first = samples.channels.index("radiance.R")
+            np.clip(values[:, first : first + 3], 0, HALF_MAX, out=values[:, first : first + 3])
+        return Planes(SAMPLES, values, half or all(SAMPLE_BUFFERS[name].half for name in samples.names))
+
+    def cut(self, position: Position | None, patch: int) -> Stored:
+        """Return a patch in the type in which it is stored, a view where it lies inside; None: everything.
+
+        Outside of the frame a patch is 0.
+        """
+        values = _window(self.values, position, patch)
+        if self._half is not None and self._fits(values):
+            return _window(self._half, position, patch)
+        return values
+
+    def black(self, position: Position, patch: int) -> bool:
+        """Return whether a patch is 0 everywhere."""
+        values = _window(self.values, position, patch)
+        return not (values[..., values.shape[-2] // 2, :].any() or values.any())
+
+    def _fits(self, values: NDArray[np.float32]) -> bool:
+        # Most often one row tells that the patch is not among the subnormal numbers.
+        if self._all_in_range and np.abs(values[..., values.shape[-2] // 2, :]).max() >= HALF_FLOOR:
+            return True
+        return _in_range(values)
+
+
+def _in_range(array: NDArray[np.float32]) -> bool:
+    largest = float(max(array.max(initial=0), -array.min(initial=0)))
+    return largest == 0.0 or HALF_FLOOR <= largest <= HALF_MAX
+
+
+def _channel_first(image: Image) -> NDArray[np.float32]:
+    planes = np.empty((image.shape[2], *image.shape[:2]), np.float32)
+    for channel, plane in enumerate(planes):
+        plane[...] = image[..., channel]
+    return planes
+
+
+def _window(array: Stored, position: Position | None, patch: int) -> Stored:
+    if position is None:
+        return array
+    height, width = array.shape[-2:]
+    x, y = position
+    if x >= 0 and y >= 0 and x + patch <= width and y + patch <= height:
+        return array[..., y : y + patch, x : x + patch]
+    result = np.zeros((*array.shape[:-2], patch, patch), array.dtype)
+    top, left, bottom, right = max(y, 0), max(x, 0), min(y + patch, height), min(x + patch, width)
+    if bottom > top and right > left:
+        result[..., top - y : bottom - y, left - x : right - x] = array[..., top:bottom, left:right]
+    return result
