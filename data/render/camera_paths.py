@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -181,9 +182,7 @@ def _curve(times: NDArray[np.float64], values: NDArray[np.float64], at: float) -
     s = (at - times[i]) / span
     weights = (2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, 3 * s**2 - 2 * s**3, s**3 - s**2)
     a, b, c, d = weights
-    return np.asarray(
-        a * values[i] + b * span * slopes[i] + c * values[i + 1] + d * span * slopes[i + 1]
-    )
+    return np.asarray(a * values[i] + b * span * slopes[i] + c * values[i + 1] + d * span * slopes[i + 1])
 
 
 def _read_keys(path: Path, view: View) -> list[_Key]:
@@ -196,7 +195,7 @@ def _read_keys(path: Path, view: View) -> list[_Key]:
     if not isinstance(entries, list) or not entries:
         raise ValueError(f'key frames {path}: expected a list of {{"frame", "origin", "target"}}')
     keys = [_key(path, i, entry, view) for i, entry in enumerate(entries)]
-    for before, after in zip(keys, keys[1:], strict=False):
+    for before, after in pairwise(keys):
         if after.frame <= before.frame:
             raise ValueError(f"{path}: frame {after.frame:g} follows frame {before.frame:g}; sort the keys")
     return keys

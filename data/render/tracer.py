@@ -98,6 +98,18 @@ class Tracer:
         view = self._view(frame)
         return Camera(view_world_to_pixel(view), np.asarray(view.to_world, np.float64)[:3, 3].copy())
 
+    def free(self, begin: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+        """Return whether nothing is on the straight way from one point to another."""
+        import mitsuba
+
+        a, b = (np.asarray(point, np.float64) for point in (begin, end))
+        length = float(np.linalg.norm(b - a))
+        if length == 0:
+            return True
+        ray: Any = mitsuba.Ray3f(mitsuba.Point3f(a.tolist()), mitsuba.Vector3f(((b - a) / length).tolist()))
+        ray.maxt = length
+        return not bool(np.any(self._scene.ray_test(ray)))
+
     def trace(
         self,
         frame: int,
@@ -164,7 +176,6 @@ class Tracer:
         drawn = seeds.generator().integers(SLICES, size=total)
         order = np.argsort(drawn, kind="stable")
         parts = np.split(order, np.cumsum(np.bincount(drawn, minlength=SLICES))[:-1])
-        # Odd chunks go backwards: the objects are already where the last slice of the previous chunk was.
         result = {name: np.zeros((total, _CHANNELS.get(name, 3)), np.float32) for name in setting.names}
         for place, lanes in enumerate(parts):
             own = seeds.next()
