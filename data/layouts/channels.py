@@ -97,7 +97,7 @@ class Gathering:
         self.put(name, array, str(image.path))
         precisions = {image.precision[c] for c in chosen}
         self.note("precision", name, precisions.pop() if len(precisions) == 1 else "mixed")
-        self.note("channels", name, [f"{image.path.name}: {c}" for c in dict.fromkeys(chosen)])
+        self.note("channels", name, [f"{image.path.name}: {', '.join(dict.fromkeys(chosen))}"])
 
     def put(self, name: str, array: Image, source: str) -> None:
         """Take an array as a buffer, repaired and clipped as in `add`.
@@ -138,10 +138,17 @@ class Gathering:
     def decode_normal(self) -> None:
         """Decode a normal that was stored as (n + 1) / 2, and say so in `notes["decoded"]`."""
         normal = self.buffers.get("normal")
-        if normal is not None and is_encoded_normal(normal):
-            known = normal.any(-1, keepdims=True)
-            self.buffers["normal"] = np.where(known, 2 * normal - 1, np.float32(0)).astype(np.float32)
-            self.note("decoded", "normal", "2 n - 1, was stored in [0, 1]")
+        if normal is None or not is_encoded_normal(normal):
+            return
+        for name in ("normal", "normal_a", "normal_b"):
+            if name in self.buffers:
+                stored = self.buffers[name]
+                decoded = np.where(stored.any(-1, keepdims=True), 2 * stored - 1, np.float32(0))
+                self.buffers[name] = decoded.astype(np.float32)
+                self.note("decoded", name, "2 n - 1, was stored in [0, 1]")
+        if "normal_variance" in self.buffers:
+            self.buffers["normal_variance"] = 4 * self.buffers["normal_variance"]
+            self.note("decoded", "normal_variance", "4 times, since the normal was stored in [0, 1]")
 
     def frame(self, scene: str, index: int, spp: int | None, notes: dict[str, Any] | None = None) -> Frame:
         """Return the frame; `notes` are added to those gathered, entries that are None left out."""

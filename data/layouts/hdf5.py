@@ -8,6 +8,7 @@ this is refused; what remains is read in slices of the first axis.
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ MAX_ITEM_BYTES = 1 << 31
 MAX_RATIO = 1100
 """Largest plausible ratio of claimed to stored bytes: deflate reaches 1032, lzf less."""
 
+_TRUSTED_CHUNK = 1 << 20
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
 
@@ -99,8 +101,9 @@ def items(source: h5py.Dataset, first: int, last: int | None = None) -> NDArray[
     if (end - first) * math.prod(source.shape[1:]) * 4 > MAX_ITEM_BYTES:
         raise ValueError(f"{where}: {end - first} items at once exceed {MAX_ITEM_BYTES >> 20} MiB")
     try:
+        _check_chunks(source, where, first, end)
         values = np.asarray(source[first:end], np.float32)
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, zlib.error) as error:
         raise ValueError(
             f"{where}, items {first} to {end - 1}: damaged ({_reason(error)}); copy the file again"
         ) from error
@@ -151,6 +154,8 @@ def _check_size(found: Any, where: str) -> None:
     claimed, stored = math.prod(found.shape) * width, found.id.get_storage_size()
     properties = found.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+    if len(set(filters)) < len(filters) or {1, 32000} <= set(filters):
+        raise ValueError(f"{where} is compressed several times over, refused")
     for number in filters:
         if number not in _FILTERS:
             known = ", ".join(_FILTERS.values())
@@ -167,6 +172,25 @@ def _check_size(found: Any, where: str) -> None:
             f"{where} claims the shape {found.shape}, {claimed} bytes, but holds only {stored}: "
             "unfinished or damaged; copy or build the file again"
         )
+
+
+def _check_chunks(source: Any, where: str, first: int, end: int) -> None:
+    """Refuse a large compressed chunk that holds more than it says, before the library inflates it whole."""
+    properties = source.id.get_create_plist()
+    filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
+    if 1 not in filters or source.chunks is None:
+        return
+    declared = math.prod(source.chunks) * source.dtype.itemsize + 64
+    whole = tuple(slice(0, length) for length in source.shape[1:])
+    for at in source.iter_chunks((slice(first, end), *whole)):
+        corner = tuple(s.start // c * c for s, c in zip(at, source.chunks, strict=True))
+        info = source.id.get_chunk_info_by_coord(corner)
+        if info.byte_offset is None or info.size <= _TRUSTED_CHUNK or info.filter_mask:
+            continue
+        _, stored = source.id.read_direct_chunk(corner)
+        # With a checksum after it the stream ends early; what follows is not inflated.
+        if len(zlib.decompressobj().decompress(stored, declared)) >= declared:
+            raise ValueError(f"{where}: the chunk at {corner} holds more than {declared - 64} bytes, refused")
 
 
 def _reason(error: Exception) -> str:

@@ -193,8 +193,9 @@ def _camera(folder: Path, index: int, frame: Frame) -> Camera | None:
     header = _header(folder)
     if header is None:
         return None
+    cameras = read_cameras(header)
     try:
-        return read_cameras(header).camera(index, frame.width, frame.height)
+        return cameras.camera(index, frame.width, frame.height)
     except ValueError as error:
         raise ValueError(f"{header}: {error}") from error
 
