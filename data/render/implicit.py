@@ -101,9 +101,15 @@ def _normals(field: Field, vertices: Floats, faces: NDArray[np.int64]) -> Floats
     return np.where((mean * slope).sum(1, keepdims=True) > 0.7, slope, mean)
 
 
+def length(vectors: Floats) -> Floats:
+    """Return the lengths of vectors (N, 3); faster than `np.linalg.norm` along a short axis."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
+
+
 def ball(centre: Floats, radius: float) -> Field:
     """Return the distance to a sphere."""
-    return lambda p: np.linalg.norm(p - centre, axis=1) - radius
+    return lambda p: length(p - centre) - radius
 
 
 def box(centre: Floats, half: Floats, turn: Floats, rounding: float = 0.05) -> Field:
@@ -111,7 +117,9 @@ def box(centre: Floats, half: Floats, turn: Floats, rounding: float = 0.05) -> F
 
     def distance(p: Floats) -> Floats:
         q = np.abs((p - centre) @ turn) - (half - rounding)
-        return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0) - rounding
+        x, y, z = q.T
+        deepest = np.minimum(np.maximum(np.maximum(x, y), z), 0)
+        return length(np.maximum(q, 0)) + deepest - rounding
 
     return distance
 
@@ -121,7 +129,7 @@ def capsule(a: Floats, b: Floats, radius: float) -> Field:
 
     def distance(p: Floats) -> Floats:
         t = np.clip((p - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-9), 0, 1)
-        return np.linalg.norm(p - a - t[:, None] * (b - a), axis=1) - radius
+        return length(p - a - t[:, None] * (b - a)) - radius
 
     return distance
 
@@ -169,8 +177,10 @@ def metaballs(rng: Rng) -> Mesh:
     radii = rng.uniform(0.15, 0.4, len(centres))
 
     def field(p: Floats) -> Floats:
-        squared = ((p[:, None, :] - centres) ** 2).sum(2)
-        return 0.5 - np.exp(-squared / radii**2 * np.log(2)).sum(1)
+        value = np.full(len(p), 0.5)
+        for centre, radius in zip(centres, radii, strict=True):
+            value -= np.exp(-((length(p - centre) / radius) ** 2) * np.log(2))
+        return value
 
     return mesh_of(field, 1.15, 26)
 

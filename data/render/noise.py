@@ -28,15 +28,13 @@ def gradient_noise(rng: Rng, size: int, cells: int) -> Floats:
     t = position - low
     low, high, fade = low % cells, (low + 1) % cells, _fade(t)
 
-    def corner(rows: NDArray[np.int64], columns: NDArray[np.int64], dy: Floats, dx: Floats) -> Floats:
-        take = np.ix_(rows, columns)
-        return gx[take] * dx[None, :] + gy[take] * dy[:, None]
-
-    top = corner(low, low, t, t)
-    top += (corner(low, high, t, t - 1) - top) * fade[None, :]
-    bottom = corner(high, low, t - 1, t)
-    bottom += (corner(high, high, t - 1, t - 1) - bottom) * fade[None, :]
-    return (top + (bottom - top) * fade[:, None]) * np.sqrt(2)
+    # Separable: gradients are weighted along y first, while there are only `cells` columns of them.
+    near, far = (1 - fade)[:, None], fade[:, None]
+    x = gx[low] * near + gx[high] * far
+    y = gy[low] * (near * t[:, None]) + gy[high] * (far * (t - 1)[:, None])
+    left = x.take(low, 1) * t + y.take(low, 1)
+    right = x.take(high, 1) * (t - 1) + y.take(high, 1)
+    return (left + (right - left) * fade) * np.sqrt(2)
 
 
 def fbm(rng: Rng, size: int, cells: int, octaves: int = 5, gain: float = 0.5) -> Floats:
@@ -99,15 +97,20 @@ class SpaceNoise:
     def __call__(self, points: Floats) -> Floats:
         """Return the noise at points (N, 3): (N,), within [-1, 1]."""
         low = np.floor(points).astype(int)
-        t = _fade(points - low)
-        x0, y0, z0 = (low % 16).T
-        x1, y1, z1 = ((low + 1) % 16).T
-        table, (tx, ty, tz) = self._table, t.T
-        a = table[x0, y0, z0] * (1 - tx) + table[x1, y0, z0] * tx
-        b = table[x0, y1, z0] * (1 - tx) + table[x1, y1, z0] * tx
-        c = table[x0, y0, z1] * (1 - tx) + table[x1, y0, z1] * tx
-        d = table[x0, y1, z1] * (1 - tx) + table[x1, y1, z1] * tx
-        return (a * (1 - ty) + b * ty) * (1 - tz) + (c * (1 - ty) + d * ty) * tz
+        tx, ty, tz = _fade(points - low).T
+        x0, y0, z0 = (low % 16).T * np.array([[256], [16], [1]])
+        x1, y1, z1 = ((low + 1) % 16).T * np.array([[256], [16], [1]])
+        table = self._table.reshape(-1)
+
+        def row(y: NDArray[np.int64], z: NDArray[np.int64]) -> Floats:
+            yz = y + z
+            start = table.take(x0 + yz)
+            return start + (table.take(x1 + yz) - start) * tx
+
+        near, far = row(y0, z0), row(y0, z1)
+        near += (row(y1, z0) - near) * ty
+        far += (row(y1, z1) - far) * ty
+        return near + (far - near) * tz
 
     def fbm(self, points: Floats, octaves: int = 4, gain: float = 0.5) -> Floats:
         """Return a sum of octaves at points (N, 3), within about [-1, 1]."""

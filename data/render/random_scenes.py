@@ -41,6 +41,7 @@ GENERATOR_VERSION = 1
 """Part of every scene's origin; raised whenever a seed would give another scene."""
 
 OBJECTS = {"outdoor": 75, "indoor": 50}
+EXPOSURE = {"outdoor": 0.6, "indoor": 0.8}
 MATERIALS = 24
 GLASSES = 3
 MAX_TRIANGLES = 500_000
@@ -173,8 +174,8 @@ def _origin(source: _Source, shot: Shot, assets: Assets | None) -> dict[str, Any
 
 
 def _level(source: _Source) -> float:
-    """Return the radiance of a grey surface: two stops around 0.3."""
-    return float(0.3 * 2 ** source.stream("exposure").uniform(-2, 2))
+    """Return the radiance of a grey surface: two stops around what puts the median pixel near 0.3."""
+    return float(EXPOSURE[source.kind] * 2 ** source.stream("exposure").uniform(-2, 2))
 
 
 def _surface(source: _Source, part: str) -> dict[str, Any]:

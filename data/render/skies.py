@@ -113,8 +113,10 @@ def _clouds(way: Floats, rng: Rng, cover: float) -> tuple[Floats, Floats]:
     flat = way / (np.maximum(way[..., 1:2], 0) + 0.12)
     flat[..., 1] = rng.uniform(0, 9)
     scale = rng.uniform(0.6, 1.6)
-    value = noise.fbm(flat.reshape(-1, 3) * scale + 8, 6).reshape(way.shape[:2])
-    thick = noise.fbm(flat.reshape(-1, 3) * scale + [8.3, 8, 8.2], 3).reshape(way.shape[:2])
+    above = flat[: HEIGHT // 2].reshape(-1, 3) * scale
+    value, thick = np.zeros((2, *way.shape[:2]))
+    value[: HEIGHT // 2] = noise.fbm(above + 8, 6).reshape(HEIGHT // 2, WIDTH)
+    thick[: HEIGHT // 2] = noise.fbm(above + np.array([8.3, 8, 8.2]), 3).reshape(HEIGHT // 2, WIDTH)
     opacity = np.clip((value - 0.35 + 0.7 * cover) * 3.5, 0, 1) * np.clip(way[..., 1] * 12, 0, 1)
     return opacity[..., None], np.clip(0.75 + 1.2 * (thick - value), 0.25, 1.2)[..., None]
 

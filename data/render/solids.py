@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,7 @@ def sphere_points(rows: int, columns: int) -> Floats:
     return np.stack([np.cos(v) * np.cos(u), np.sin(v), np.cos(v) * np.sin(u)], -1)
 
 
+@lru_cache(maxsize=4)
 def icosphere(level: int) -> tuple[Floats, Faces]:
     """Return vertices on the unit sphere and faces: an icosahedron divided `level` times."""
     g = (1 + 5**0.5) / 2
@@ -64,9 +67,9 @@ def divided(vertices: Floats, faces: Faces) -> tuple[Floats, Faces]:
     """Return every face cut into four at the middles of its edges."""
     a, b, c = faces.T
     edges = np.sort(np.concatenate([np.stack(e, 1) for e in ((a, b), (b, c), (c, a))]), 1)
-    unique, number = np.unique(edges, axis=0, return_inverse=True)
+    unique, number = np.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_inverse=True)
     ab, bc, ca = (number.reshape(-1) + len(vertices)).reshape(3, -1)
-    middle = (vertices[unique[:, 0]] + vertices[unique[:, 1]]) / 2
+    middle = (vertices[unique // len(vertices)] + vertices[unique % len(vertices)]) / 2
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     return np.concatenate([vertices, middle]), np.concatenate([np.stack(p, 1) for p in parts])
 
@@ -210,7 +213,7 @@ def _box_polygons(half: Floats) -> list[Floats]:
 def fragments(rng: Rng) -> Mesh:
     """Return a box broken into Voronoi cells that have drifted apart."""
     half = rng.uniform(0.4, 0.9, 3)
-    seeds = rng.uniform(-1, 1, (int(rng.integers(6, 15)), 3)) * half
+    seeds = rng.uniform(-1, 1, (int(rng.integers(5, 11)), 3)) * half
     gap, pieces = rng.uniform(0.05, 0.4), []
     for i, seed in enumerate(seeds):
         polygons = _box_polygons(half)
@@ -218,12 +221,11 @@ def fragments(rng: Rng) -> Mesh:
             normal = unit(other - seed)
             polygons = _clipped(polygons, normal, float(normal @ (seed + other) / 2))
         fans = [np.stack([p[0], p[k], p[k + 1]]) for p in polygons for k in range(1, len(p) - 1)]
-        vertices, faces = np.concatenate(fans), np.arange(3 * len(fans)).reshape(-1, 3)
-        vertices, faces = divided(*divided(vertices, faces))
-        piece = box_uvs(flat(vertices, faces), 0.7)
         turn = random_turn(rng) if rng.random() < 0.1 else np.eye(3)
-        pieces.append(transformed(piece, affine(turn, turn @ -seed + seed * (1 + gap))))
-    return joined(pieces)
+        pieces.append((np.concatenate(fans) - seed) @ turn.T + seed * (1 + gap))
+    vertices = np.concatenate(pieces)
+    corners = np.arange(len(vertices)).reshape(-1, 3)
+    return box_uvs(flat(*divided(*divided(vertices, corners))), 0.7)
 
 
 def plate(rng: Rng) -> Mesh:
@@ -244,7 +246,8 @@ def plate(rng: Rng) -> Mesh:
     middle = [
         np.array([i - (columns - 1) / 2, 0, j - (rows - 1) / 2]) for i in range(columns) for j in range(rows)
     ]
-    tiles = [transformed(box_uvs(s), affine(np.eye(3), m)) for m in middle for s in strips]
+    tile = joined([box_uvs(s) for s in strips])
+    tiles = [transformed(tile, affine(np.eye(3), m)) for m in middle]
     rim = box_uvs(_frame(side, columns, rows))
     return joined([*tiles, rim])
 
@@ -296,13 +299,12 @@ def terrain(rng: Rng) -> Mesh:
 
 def towers(rng: Rng) -> Mesh:
     """Return a field of blocks of different heights."""
-    count, parts = int(rng.integers(6, 10)), []
-    heights = rng.gamma(1.5, 0.5, (count, count)) + 0.1
-    for i in range(count):
-        for j in range(count):
-            half = np.array([rng.uniform(0.3, 0.5), heights[i, j] / 2, rng.uniform(0.3, 0.5)])
-            quads = [np.stack([p[[0, 1, 2]], p[[0, 2, 3]]]) for p in _box_polygons(half)]
-            vertices = np.concatenate(quads).reshape(-1, 3) + np.array([i, half[1], j])
-            parts.append(flat(vertices, np.arange(36).reshape(-1, 3)))
-    block = joined([box_uvs(p) for p in parts])
-    return transformed(block, affine(np.diag([1, rng.uniform(0.5, 2.0), 1])))
+    count = int(rng.integers(6, 10))
+    quads = [np.stack([p[[0, 1, 2]], p[[0, 2, 3]]]) for p in _box_polygons(np.ones(3))]
+    block = np.concatenate(quads).reshape(-1, 3)
+    half = rng.uniform(0.3, 0.5, (count, count, 3))
+    half[..., 1] = (rng.gamma(1.5, 0.5, (count, count)) + 0.1) * rng.uniform(0.25, 1.0)
+    z, x = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
+    middle = np.stack([x, half[..., 1], z], -1)
+    vertices = (block * half[:, :, None] + middle[:, :, None]).reshape(-1, 3)
+    return box_uvs(flat(vertices, np.arange(len(vertices)).reshape(-1, 3)))

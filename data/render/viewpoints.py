@@ -80,10 +80,13 @@ class Sketch:
         t = np.where(hit, along - np.sqrt(np.maximum(half, 0)), np.inf)
         thing = t.argmin(1)
         nearest = np.maximum(t.min(1), 1e-3)
-        ground = np.full(len(directions), 0.05)
-        for _ in range(40):
-            step = self.around.clearance(origin + ground[:, None] * directions)
-            ground = np.minimum(ground + np.maximum(step, 0.0), FAR)
+        ground, going = np.full(len(directions), 0.05), np.arange(len(directions))
+        for _ in range(32):
+            step = self.around.clearance(origin + ground[going, None] * directions[going])
+            ground[going] = np.minimum(ground[going] + np.maximum(step, 0.0), FAR)
+            going = going[(step > 0.02) & (ground[going] < np.minimum(nearest[going], FAR))]
+            if not len(going):
+                break
         ground = np.where(ground >= FAR, np.inf, ground)
         thing = np.where(np.isfinite(nearest) & (nearest < ground), thing, -1)
         return Seen(np.minimum(nearest, ground), thing, directions)
