@@ -113,6 +113,11 @@ class Recipe:
         """Quantities of the noisy samples."""
         return {"stills": STILLS, "sequences": SEQUENCES, "samples": SAMPLES}[self.kind]
 
+    @property
+    def reference_names(self) -> tuple[str, ...]:
+        """Quantities of a reference's samples; only methods for stills have the light split."""
+        return ("radiance", "diffuse") if self.kind == "stills" else ("radiance",)
+
     def samples_per_view(self) -> int:
         """Return how many samples a view needs, reference included."""
         return self.pixels * (self.spp[-1] + self.reference_spp)

@@ -27,7 +27,7 @@ class Reference:
     Attributes:
         passes: Number of passes in the sums.
         count: Samples per pixel in the sums.
-        total: Sums (H, W, 6): radiance and its diffuse part, float64.
+        total: Sums (H, W, 3) of radiance, or (H, W, 6) with its diffuse part; float64.
         squares: Sums of squared radiance (H, W, 3), float64.
         invalid: Samples that were NaN or Inf and count as 0.
     """
@@ -39,21 +39,22 @@ class Reference:
     invalid: int = 0
 
     @staticmethod
-    def empty(height: int, width: int) -> Reference:
-        """Return a reference without passes."""
-        return Reference(0, 0, np.zeros((height, width, 6)), np.zeros((height, width, 3)))
+    def empty(height: int, width: int, split: bool = False) -> Reference:
+        """Return a reference without passes; `split`: with the diffuse part."""
+        return Reference(0, 0, np.zeros((height, width, 6 if split else 3)), np.zeros((height, width, 3)))
 
     @staticmethod
-    def load(path: Path, height: int, width: int) -> Reference:
+    def load(path: Path, height: int, width: int, split: bool = False) -> Reference:
         """Read what an earlier call saved; an empty reference where there is nothing readable."""
+        nothing = Reference.empty(height, width, split)
         try:
             with np.load(path, allow_pickle=False) as file:
                 passes, count, invalid = (int(n) for n in file["counts"])
                 result = Reference(passes, count, file["total"], file["squares"], invalid)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-            return Reference.empty(height, width)
-        fits = result.total.shape == (height, width, 6) and result.squares.shape == (height, width, 3)
-        return result if fits else Reference.empty(height, width)
+            return nothing
+        fits = (result.total.shape, result.squares.shape) == (nothing.total.shape, nothing.squares.shape)
+        return result if fits else nothing
 
     def save(self, path: Path) -> None:
         """Write the sums, whole or not at all.
@@ -73,10 +74,13 @@ class Reference:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def add(self, rows: slice, radiance: NDArray[np.float32], diffuse: NDArray[np.float32]) -> None:
+    def add(
+        self, rows: slice, radiance: NDArray[np.float32], diffuse: NDArray[np.float32] | None = None
+    ) -> None:
         """Add samples (S, h, W, 3) of a band of rows; the caller counts passes and samples."""
         self.total[rows, :, :3] += radiance.sum(0, dtype=np.float64)
-        self.total[rows, :, 3:] += diffuse.sum(0, dtype=np.float64)
+        if diffuse is not None:
+            self.total[rows, :, 3:] += diffuse.sum(0, dtype=np.float64)
         self.squares[rows] += np.einsum("shwc,shwc->hwc", radiance, radiance, dtype=np.float64)
 
     def radiance(self) -> Image:

@@ -96,7 +96,7 @@ def render_view(work: ViewWork, tracer: Tracing, renderer: str, report: Report) 
         records = [_write(work, frame) for frame in frames]
         memory = _remember(work, tracer.spec, renderer, records, 0)
         report(recipe.pixels * recipe.spp[-1])
-    reference = Reference.load(work.sums, recipe.height, recipe.width)
+    reference = Reference.load(work.sums, recipe.height, recipe.width, recipe.kind == "stills")
     while reference.count < recipe.reference_spp:
         before = reference.count
         add_pass(reference, tracer, work)
@@ -117,8 +117,8 @@ def add_pass(reference: Reference, tracer: Tracing, work: ViewWork) -> None:
     seed = seed_of(work.key, "reference", reference.count)
     static = work.recipe.kind == "sequences"
     before = tracer.invalid
-    for chunk in tracer.trace(work.view, spp, seed, ("radiance", "diffuse"), static=static):
-        reference.add(chunk.rows, chunk.values["radiance"], chunk.values["diffuse"])
+    for chunk in tracer.trace(work.view, spp, seed, work.recipe.reference_names, static=static):
+        reference.add(chunk.rows, *(chunk.values[name] for name in work.recipe.reference_names))
     reference.invalid += tracer.invalid - before
     reference.passes += 1
     reference.count += spp

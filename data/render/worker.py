@@ -65,7 +65,7 @@ def speed_of(source: Source, recipe: Recipe) -> float:
     seconds = 0.0
     for seed in range(2):
         began = time.perf_counter()
-        for _ in tracer.trace(0, spp, seed, ("radiance", "diffuse")):
+        for _ in tracer.trace(0, spp, seed, recipe.reference_names):
             pass
         seconds = time.perf_counter() - began
     return spp * recipe.pixels / seconds
