@@ -8,7 +8,6 @@ and at the headers of a few files where names do not tell; it never raises for a
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +41,7 @@ def layout(name: str) -> Any:
 
 def likenesses(root: str | Path) -> dict[str, float]:
     """Return how much a folder resembles each layout, those that it resembles at all, best first."""
-    present = [name for name in LAYOUTS if importlib.util.find_spec(f"data.layouts.{name}")]
-    scores = {name: layout(name).likeness(Path(root)) for name in present}
+    scores = {name: layout(name).likeness(Path(root)) for name in LAYOUTS}
     return dict(sorted(((n, s) for n, s in scores.items() if s > 0), key=lambda pair: -pair[1]))
 
 
