@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from data.duplicates import Pair
 from data.manifest import Manifest
-from data.statistics import Pair
 from trainer.reports.frame_facts import FrameFacts
 from trainer.reports.svg import percent
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from data.buffers import BUFFERS, buffer
 from data.derive import derive
+from data.duplicates import Fingerprint, fingerprint
 from data.exr import RadianceWarning, looks_encoded
 from data.frame import Frame
 from data.frames import FrameSet
@@ -22,10 +23,8 @@ from data.manifest import MANIFEST, FrameRecord
 from data.patches import patch_count, uniform_positions
 from data.shards.cut import PrepareOptions
 from data.statistics import (
-    Fingerprint,
     Histogram,
     energy,
-    fingerprint,
     firefly_mask,
     histograms,
     no_hit_share,
@@ -227,13 +226,15 @@ def _wrong_normals(normal: Array) -> str:
     """Return why normals are not unit vectors; means over a pixel may be shorter than 1, never longer."""
     length = np.linalg.norm(normal, axis=-1)
     hit = length > 0
+    typical = float(np.median(length[hit])) if hit.any() else 1.0
+    decoded = float(np.median(np.linalg.norm(2 * normal - 1, axis=-1)))
+    if abs(decoded - 1) < 0.01 < abs(typical - 1):
+        return "they look like unit vectors mapped to [0, 1] for display"
     share = float((length > 1.01).mean())
     if share > 0:
         return f"{100 * share:.2g} % of the pixels have normals longer than 1, up to {length.max():.3g}"
-    if hit.any() and float(normal[hit].min()) >= 0:
-        return "no component is negative, as in normals that were mapped to [0, 1] for display"
-    if hit.any() and float(np.median(length[hit])) < 0.9:
-        return f"half of the normals are shorter than {np.median(length[hit]):.2g}"
+    if typical < 0.9:
+        return f"half of the normals are shorter than {typical:.2g}"
     return ""
 
 
@@ -297,9 +298,7 @@ def densities(frame: Frame, color: Array, limit: int) -> tuple[int, dict[str, Th
     for name, share in shares.items():
         picture = density_picture(color, frame.exposure or 1.0, share / highest, limit)
         centres = [((x + patch / 2) / size[0], (y + patch / 2) / size[1]) for x, y in drawn[name]]
-        note = (
-            f"{len(centres)} patches of this frame; on average a pixel is in {percent(float(share.min()))} to "
-            f"{percent(float(share.max()))} of them"
-        )
+        low, high = percent(float(share.min())), percent(float(share.max()))
+        note = f"{len(centres)} patches of this frame; on average {low} to {high} of them hold a pixel"
         found[name] = thumbnail(with_dots(picture, centres), limit, note, flat=True)
     return patch, found

@@ -1,7 +1,8 @@
-"""Inline SVG drawings of the data report; colours come from the page's style sheet."""
+"""Inline SVG drawings and numbers of the data report; colours come from the page's style sheet."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from markupsafe import Markup
@@ -58,6 +59,22 @@ def percent(share: float) -> str:
     if value == 0 or abs(value) >= 9.95:
         return f"{value:.0f} %"
     return f"{value:.1f} %" if abs(value) >= 0.95 else f"{value:.2g} %"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with so many significant digits, – where there is none."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    return f"{value:.{digits}g}".replace("-", "−", 1) if value < 0 else f"{value:.{digits}g}"
+
+
+def fixed(value: float | None, digits: int) -> str:
+    """Return a number with so many decimals, – where there is none."""
+    if value is None or not math.isfinite(value):
+        return number(value)
+    return f"{value:.{digits}f}".replace("-", "−")
 
 
 def split_svg(counts: Mapping[str, int]) -> Markup:

@@ -19,6 +19,9 @@ Array = NDArray[np.float32]
 QUALITY = 82
 """JPEG quality of thumbnails."""
 
+FEW = 1024
+"""Colours up to which a picture may be smaller as PNG, which takes long to try."""
+
 PERCENTILES = (1.0, 99.0)
 """Values of distances and variances between which the colours of a thumbnail reach."""
 
@@ -49,10 +52,9 @@ def thumbnail(picture: Image.Image, limit: int, note: str = "", *, flat: bool = 
         flat: The colours mean something, so JPEG must keep their resolution.
     """
     picture = reduced(picture, limit)
-    options: dict[str, dict[str, Any]] = {
-        "JPEG": {"quality": QUALITY, "subsampling": 0 if flat else 2},
-        "PNG": {"optimize": True},
-    }
+    options: dict[str, dict[str, Any]] = {"JPEG": {"quality": QUALITY, "subsampling": 0 if flat else 2}}
+    if picture.getcolors(FEW) is not None:
+        options["PNG"] = {}
     coded = {}
     for kind, settings in options.items():
         stream = io.BytesIO()

@@ -1,0 +1,524 @@
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data.frame import Frame, Samples
+from data.frames import FrameSet
+from data.ingestion import write_record
+from data.manifest import Manifest, SceneRecord
+from tests.data.miniature import Crop, ingested, sample_crop
+from trainer.reports import data_report
+from trainer.reports.data_page import column_frames, noise_rows, strip_frames
+from trainer.reports.data_report import examine, make_jobs, write_report
+from trainer.reports.findings import findings
+from trainer.reports.frame_facts import scores
+from trainer.reports.svg import fixed, number, percent
+from trainer.reports.thumbnails import buffer_thumbnail, expected_coverage, picture_of, window
+
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "dataset" / "stills"
+
+
+def made(root, scenes, splits=None, **records):
+    """Write frames as a data set; scenes is name → frames, splits as in the manifest."""
+    kept = {
+        name: SceneRecord(
+            frames=tuple(write_record(replace(f, scene=name), root) for f in frames),
+            **{"sequence": False, "license": "CC0", **records.get(name.replace("-", "_"), {})},
+        )
+        for name, frames in scenes.items()
+    }
+    names = list(scenes)
+    splits = splits or {"train": names[:-1], "validation": [], "test": names[-1:]}
+    Manifest("made", "rendered", "euclidean", splits, kept).save(root)
+    return root
+
+
+def levels(scene="cbox-glossy", spps=(4, 16), views=2):
+    """Return frames of one scene: views with several numbers of samples, as a rendered set of stills has."""
+    frames = []
+    for view in range(views):
+        base = sample_crop(scene, 3 * view)
+        for spp in spps:
+            generator = np.random.default_rng(spp)
+            noise = generator.gamma(spp, 1 / spp, base.buffers["color"].shape[:2])[..., None]
+            color = (base.buffers["reference"] * noise).astype(np.float32)
+            buffers = base.buffers | {"color": color, "color_variance": np.square(color) / np.float32(spp)}
+            buffers.pop("irradiance")
+            notes = {"view": view, "reference_spp": 512}
+            frames.append(replace(base, buffers=buffers, index=len(frames), spp=spp, notes=notes))
+    return frames
+
+
+def report(root, tmp_path, **options):
+    found = write_report(root, tmp_path / "report.html", **options)
+    return found, (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def texts(found, level=None):
+    return " | ".join(f.text for f in found if level in (None, f.level))
+
+
+class Page(HTMLParser):
+    """Collects tags; complains where elements are not closed in order."""
+
+    void = {"meta", "img", "br", "path", "line", "rect"}
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags = [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.void:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def all(self, tag, key):
+        return [a[key] for t, a in self.tags if t == tag and key in a]
+
+
+def test_the_page_is_one_file_that_loads_nothing(tmp_path):
+    _, text = report(ingested(tmp_path), tmp_path)
+    page = Page(text)
+    sources = page.all("img", "src")
+    assert len(sources) > 20
+    assert all(s.startswith(("data:image/jpeg;base64,", "data:image/png;base64,")) for s in sources)
+    assert not page.all("link", "href")
+    assert not page.all("script", "src")
+    assert "http" not in text.replace("http://www.w3.org", "")
+    assert "@import" not in text
+    assert "url(" not in text
+
+
+def test_every_link_of_the_page_has_a_target(tmp_path):
+    _, text = report(ingested(tmp_path), tmp_path)
+    page = Page(text)
+    ids = {i for _, a in page.tags if (i := a.get("id"))}
+    links = page.all("a", "href")
+    assert {"#scene-0", "#scene-1"} <= set(links)
+    assert {link.removeprefix("#") for link in links} <= ids
+
+
+def test_every_buffer_of_a_scene_has_a_picture_with_its_name(tmp_path):
+    root = made(tmp_path / "set", {"a": levels(), "b": levels("classroom")})
+    _, text = report(root, tmp_path)
+    alts = Page(text).all("img", "alt")
+    names = FrameSet(root).read("a", 1).buffers
+    assert {"color", "reference", "albedo", "normal", "depth", "position", "color_variance"} <= names.keys()
+    for name in names:
+        assert f"a, frame 1: {name}" in alts
+
+
+def test_pictures_are_decoded_when_they_come_into_view(tmp_path):
+    _, text = report(ingested(tmp_path), tmp_path)
+    shown = [a for t, a in Page(text).tags if t == "img" and "src" in a]
+    assert all(a["loading"] == "lazy" and a["width"] and a["height"] for a in shown)
+
+
+def test_names_from_the_manifest_cannot_inject_markup(tmp_path):
+    credit = {"a": {"credit": "<script>alert(1)</script>", "origin": {"kind": "</pre><b>x"}}}
+    root = made(tmp_path / "set", {"a": levels(), "b": levels("classroom")}, **credit)
+    _, text = report(root, tmp_path)
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert "</pre><b>x" not in text
+
+
+def test_the_same_data_give_the_same_page_with_one_process_and_with_two(tmp_path):
+    root = made(tmp_path / "set", {"a": levels(views=1), "b": levels("classroom", views=1)})
+    _, one = report(root, tmp_path)
+    _, two = report(root, tmp_path, processes=2, force=True)
+    assert one == two
+
+
+def test_progress_counts_every_frame_once(tmp_path):
+    calls = []
+    root = ingested(tmp_path)
+    write_report(root, tmp_path / "r.html", progress=lambda *a: calls.append(a))
+    assert [c[:2] for c in calls] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert len({c[2] for c in calls}) == 4
+
+
+def test_views_with_several_numbers_of_samples_are_shown_side_by_side(tmp_path):
+    root = made(tmp_path / "set", {"a": levels(spps=(4, 16, 64)), "b": levels("classroom")})
+    scene = FrameSet(root).manifest.scenes["a"]
+    assert [f.spp for f in column_frames(scene)] == [4, 16, 64]
+    assert [(f.view, f.spp) for f in strip_frames(scene)] == [(0, 64), (1, 64)]
+    _, text = report(root, tmp_path)
+    alts = Page(text).all("img", "alt")
+    assert [alt for alt in alts if alt.startswith("a, ") and "spp" in alt] == [
+        "a, 4 spp", "a, 16 spp", "a, 64 spp",
+    ]  # fmt: skip
+    assert "a, reference" in alts
+
+
+def test_noise_is_stated_per_scene_and_number_of_samples_with_the_metrics_of_the_trainer(tmp_path):
+    root = made(tmp_path / "set", {"a": levels(), "b": levels("classroom")})
+    frames = FrameSet(root)
+    facts = examine(frames)
+    views = [data_report_view(frames, name, facts) for name in ("a", "b")]
+    rows = noise_rows(views)
+    assert [(r["scene"].name, r["spp"], r["frames"]) for r in rows] == [
+        ("a", 4, 2), ("a", 16, 2), ("b", 4, 2), ("b", 16, 2),
+    ]  # fmt: skip
+    frame = frames.read("a", 0)
+    x, r = (frame.buffers[n] * np.float32(frame.exposure) for n in ("color", "reference"))
+    display = [np.clip(np.maximum(i.astype(np.float64), 0) ** 0.454545, 0, 1) for i in (x, r)]
+    psnr = -10 * np.log10(np.square(display[0] - display[1]).mean())
+    assert facts[0].scores["psnr_wskp"] == pytest.approx(psnr, abs=1e-3)
+    assert facts[0].scores["relmse_layer"] == pytest.approx(np.mean((x - r) ** 2 / (r**2 + 1e-4)), rel=1e-4)
+    assert rows[0]["psnr"] == pytest.approx(np.mean([facts[i].scores["psnr_wskp"] for i in (0, 2)]))
+    assert rows[0]["psnr"] < rows[1]["psnr"]
+
+
+def data_report_view(frames, name, facts):
+    from trainer.reports.data_page import _scene_view
+
+    return _scene_view(frames.manifest, name, [f for f in facts if f.scene == name])
+
+
+def test_equal_input_and_reference_have_an_infinite_psnr_that_the_page_can_show(tmp_path):
+    image = np.random.default_rng(0).random((8, 8, 3), np.float32)
+    assert scores(image, image) == {"psnr_wskp": float("inf"), "relmse_layer": 0.0}
+    frame = sample_crop("classroom", 0).with_buffers()
+    frame.buffers["color"] = frame.buffers["reference"]
+    _, text = report(made(tmp_path / "set", {"a": [frame], "b": levels()}), tmp_path)
+    assert "∞" in text
+
+
+def test_a_damaged_frame_is_a_problem_and_the_others_are_shown(tmp_path):
+    root = ingested(tmp_path)
+    (root / "classroom" / "f001.exr").write_bytes(b"x")
+    (root / "cbox-glossy" / "f000.exr").unlink()
+    found, text = report(root, tmp_path)
+    assert found[0].level == "problem"
+    assert found[0].damaged
+    assert "2 frames cannot be read" in found[0].text
+    assert "f001.exr has 1 bytes" in text
+    assert "f000.exr is missing" in text
+    assert "classroom, frame 0: color" in Page(text).all("img", "alt")
+
+
+def test_a_set_without_any_readable_frame_still_has_a_page(tmp_path):
+    root = ingested(tmp_path)
+    for path in root.glob("*/*.exr"):
+        path.write_bytes(b"x")
+    found, text = report(root, tmp_path)
+    assert "4 frames cannot be read" in found[0].text
+    Page(text)
+
+
+def test_a_planted_duplicate_across_splits_is_a_problem_with_both_pictures(tmp_path):
+    whole = Crop(0, 0, 320, 180)
+    frame = sample_crop("living-room-2", 0, whole)
+    generator = np.random.default_rng(1)
+    other = frame.buffers["reference"] * generator.exponential(size=(180, 320, 1)).astype(np.float32)
+    again = replace(frame, buffers=frame.buffers | {"color": other})
+    again.buffers.pop("irradiance")
+    scenes = {"room": [frame], "classroom": [sample_crop("classroom", 0, whole)], "copy": [again]}
+    found, text = report(made(tmp_path / "set", scenes), tmp_path)
+    (alike,) = [f for f in found if "same view" in f.text]
+    assert (alike.level, alike.scenes) == ("problem", ("room", "copy"))
+    assert "same view in different splits" in text
+    splits = {"train": ["room", "copy"], "validation": [], "test": ["classroom"]}
+    found, text = report(made(tmp_path / "again", scenes, splits), tmp_path, force=True)
+    (alike,) = [f for f in found if "same view" in f.text]
+    assert alike.level == "note"
+    assert "same view, one split" in text
+
+
+def test_consecutive_frames_and_different_scenes_are_not_called_alike(tmp_path):
+    found, text = report(ingested(tmp_path, frames=3), tmp_path)
+    assert "same view" not in texts(found)
+    assert "No two scenes show the same view." in text
+
+
+def found_in(tmp_path, change, **notes):
+    """Return what is found in a set whose first scene's frame is changed."""
+    frame = levels(views=1, spps=(16,))[0]
+    frame.notes.update(notes)
+    root = made(tmp_path / "set", {"a": [change(frame)], "b": levels("classroom")})
+    frames = FrameSet(root)
+    return [f for f in findings(frames.manifest, examine(frames), []) if "a" in f.scenes]
+
+
+def buffers(**changes):
+    def change(frame):
+        kept = frame.with_buffers()
+        for name, function in changes.items():
+            if function is None:
+                del kept.buffers[name]
+            else:
+                kept.buffers[name] = function(kept.buffers[name]).astype(np.float32)
+        return kept
+
+    return change
+
+
+def same(frame):
+    return frame
+
+
+def longer(normal):
+    return normal * 1.3
+
+
+def quantised(image):
+    return np.round(np.clip(image, 0, 1) * 255) / 255
+
+
+@pytest.mark.parametrize(
+    ("change", "notes", "level", "text"),
+    [
+        (buffers(reference=None), {}, "warning", "1 frame has no reference"),
+        (same, {"repaired": {"color": 3, "depth": 1}}, "warning", "4 pixels in 1 frame were NaN or Inf"),
+        (same, {"checks": {"energy_z": -4.5}}, "warning", "differ in mean radiance by more than 4"),
+        (buffers(color=lambda c: c * 1.5), {}, "warning", "differ in mean radiance by more than 4"),
+        (same, {"checks": {"reference_relmse": 1.0}}, "warning", "is itself noisy"),
+        (same, {"reference_spp": 64}, "warning", "less than 8 times the input's samples"),
+        (buffers(color=quantised), {}, "warning", "looks 8-bit or tone-mapped"),
+        (buffers(albedo=lambda a: a * 0 + 1.5), {}, "warning", "albedo: values outside"),
+        (buffers(normal=longer), {}, "warning", "not unit vectors"),
+        (buffers(normal=lambda n: n * 0.5 + 0.5), {}, "warning", "not unit vectors"),
+        (buffers(normal=lambda n: n * 0), {}, "note", "normal: the same in all pixels"),
+        (buffers(color=lambda c: np.where(np.arange(48)[:, None] < 8, 1e3, c)), {}, "note", "fireflies"),
+    ],
+)
+def test_what_would_spoil_training_is_found(tmp_path, change, notes, level, text):
+    found = found_in(tmp_path, change, **notes)
+    assert text in texts(found, level)
+
+
+def test_nothing_is_found_in_a_good_frame(tmp_path):
+    assert found_in(tmp_path, same) == []
+
+
+def test_an_energy_score_within_limits_is_not_reported(tmp_path):
+    assert found_in(tmp_path, same, checks={"energy_z": 3.9, "reference_relmse": 1e-6}) == []
+
+
+def test_missing_licences_splits_and_buffers_are_found(tmp_path):
+    bare = buffers(depth=None, position=None)(levels(views=1, spps=(4,))[0])
+    root = made(
+        tmp_path / "set",
+        {"a": [bare], "b": levels("classroom")},
+        {"train": ["a", "b"], "validation": [], "test": []},
+        b={"license": ""},
+    )
+    found, _ = report(root, tmp_path)
+    assert "1 scene does not state a licence" in texts(found, "warning")
+    assert "no scene in split test" in texts(found, "note")
+    (missing,) = [f for f in found if f.text.startswith("missing in frames")]
+    assert missing.scenes == ("a",)
+    assert "depth" in missing.text
+    assert "position" in missing.text
+
+
+def test_problems_come_first(tmp_path):
+    root = ingested(tmp_path)
+    (root / "classroom" / "f001.exr").write_bytes(b"x")
+    order = [f.level for f in report(root, tmp_path)[0]]
+    assert order == sorted(order, key=["problem", "warning", "note"].index)
+    assert order[0] == "problem"
+
+
+def test_samples_kept_apart_are_shown_by_their_mean(tmp_path):
+    base = sample_crop("classroom", 0)
+    radiance = np.stack([base.buffers["color"] * np.float32(k) for k in (0.5, 1.5)])
+    kept = {n: base.buffers[n] for n in ("reference", "normal")}
+    frame = replace(base, buffers=kept, spp=2, samples=Samples.of({"radiance": radiance}))
+    root = made(tmp_path / "set", {"a": [frame], "b": levels()})
+    facts = examine(FrameSet(root))[0]
+    assert "color" in facts.thumbnails
+    expected = sample_crop("classroom", 0).buffers
+    exposed = [expected[n].astype(np.float16).astype(np.float32) for n in ("color", "reference")]
+    plain = scores(*(i * np.float32(base.exposure) for i in exposed))
+    assert facts.scores["psnr_wskp"] == pytest.approx(plain["psnr_wskp"], abs=0.05)
+    assert "kept per sample: radiance" in report(root, tmp_path)[1]
+
+
+def test_the_motion_of_a_sequence_is_that_of_its_second_frame(tmp_path):
+    frames = [
+        sample_crop("classroom", i).with_buffers(motion=np.full((32, 48, 2), i, np.float32)) for i in (0, 1)
+    ]
+    root = made(tmp_path / "set", {"a": frames, "b": levels()}, a={"sequence": True})
+    _, text = report(root, tmp_path)
+    assert "motion of frame 1" in Page(text).all("img", "alt")
+    assert "hue: direction, up to 1.4 px" in text
+
+
+def test_checks_origin_recipe_and_reference_noise_are_on_the_page(tmp_path):
+    frames = levels(views=1)
+    frames[0].notes["checks"] = {"energy_z": 1.25, "reference_relmse": 0.00125}
+    root = made(tmp_path / "set", {"a": frames, "b": levels()}, a={"origin": {"seed": 4711}})
+    manifest = FrameSet(root).manifest
+    replace(manifest, recipe={"recipe": "stills"}).save(root)
+    _, text = report(root, tmp_path)
+    for expected in ("4711", "0.00125", "&#34;recipe&#34;: &#34;stills&#34;", manifest.hash[:0]):
+        assert expected in text
+
+
+def test_thumbnails_shrink_so_that_the_page_stays_small(tmp_path, monkeypatch):
+    root = made(tmp_path / "set", {"a": levels(views=1), "b": levels("classroom", views=1)})
+    jobs = make_jobs(FrameSet(root))
+    assert {(j.pictures, j.limit) for j in jobs if j.pictures != "none"} == {("all", 320)}
+    monkeypatch.setattr(data_report, "PAGE", 1.0)
+    jobs = make_jobs(FrameSet(root))
+    assert [j.pictures for j in jobs if j.pictures != "none"] == ["all", "main"]
+    assert {j.limit for j in jobs} == {128}
+    Page(report(root, tmp_path)[1])
+
+
+def test_large_frames_are_reduced_and_their_middle_shown_in_full_size(tmp_path):
+    frame = sample_crop("living-room-2", 0, Crop(0, 0, 320, 180))
+    large = replace(frame, buffers={n: np.repeat(b, 2, 1) for n, b in frame.buffers.items()}, camera=None)
+    facts = examine(FrameSet(made(tmp_path / "set", {"a": [large], "b": levels()})))[0]
+    assert (facts.thumbnails["color"].width, facts.thumbnails["color"].height) == (320, 90)
+    assert facts.columns["color"].width == 320
+    middle = window(large.buffers["color"], 320)
+    np.testing.assert_array_equal(middle, large.buffers["color"][:, 160:480])
+
+
+def test_both_ways_to_choose_patches_are_drawn_over_the_frame(tmp_path):
+    facts = examine(FrameSet(ingested(tmp_path)))[0]
+    assert list(facts.density) == ["uniform", "importance"]
+    assert facts.patch == 16  # half of the shorter side, as the frame is smaller than a patch
+    assert all("of them hold a pixel" in t.note for t in facts.density.values())
+
+
+def test_the_density_is_the_share_of_patches_that_cover_a_pixel():
+    weights = np.random.default_rng(0).random((5, 7)).astype(np.float32)
+    expected = np.zeros((7, 9))
+    for y in range(5):
+        for x in range(7):
+            expected[y : y + 3, x : x + 3] += weights[y, x] / weights.sum()
+    np.testing.assert_allclose(expected_coverage(weights, 3), expected, atol=1e-6)
+    np.testing.assert_allclose(expected_coverage(np.zeros((1, 1), np.float32), 3), 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "pixel"),
+    [
+        ("color", (0.5, 0.5, 0.5), (255, 255, 255)),
+        ("normal", (0, 0, 1), (128, 128, 255)),
+        ("albedo", (1, 0, 0), (255, 0, 0)),
+        ("roughness", (1,), (255, 255, 255)),
+        ("depth", (0,), (0, 0, 0)),
+        ("position", (0, 0, 0), (0, 0, 0)),
+        ("motion", (0, 0), (0, 0, 0)),
+    ],
+)
+def test_values_become_the_stated_colours(name, value, pixel):
+    image = np.tile(np.array(value, np.float32), (4, 4, 1))
+    picture, _ = picture_of(name, image, 2.0)
+    difference = np.abs(np.asarray(picture)[0, 0].astype(int) - pixel)
+    assert difference.max() <= 3
+
+
+def test_near_is_brighter_than_far_and_noisy_brighter_than_clean():
+    ramp = np.linspace(1, 100, 64, dtype=np.float32).reshape(8, 8, 1)
+    depth = np.asarray(picture_of("depth", ramp, 1.0)[0]).sum(-1).ravel()
+    variance = np.asarray(picture_of("depth_variance", ramp, 1.0)[0]).sum(-1).ravel()
+    assert depth[0] > depth[32] > depth[-1]
+    assert variance[0] < variance[32] < variance[-1]
+
+
+@pytest.mark.parametrize("name", ["color", "normal", "depth", "position", "motion", "color_variance", "hit"])
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, 1e30, -1.0])
+def test_any_values_give_a_picture(name, value):
+    from data.buffers import buffer
+
+    image = np.full((5, 9, buffer(name).channels), value, np.float32)
+    thumb = buffer_thumbnail(name, image, 1.0, 4)
+    kind, _, coded = thumb.uri.partition(";base64,")
+    import base64
+
+    with Image.open(BytesIO(base64.b64decode(coded))) as picture:
+        assert picture.size == (thumb.width, thumb.height) == (4, 2)
+        assert kind == f"data:image/{picture.format.lower()}"
+
+
+def test_numbers_are_short_and_say_what_is_unknown():
+    assert [number(v) for v in (None, float("nan"), float("inf"), 0.00123456, -2.0)] == [
+        "–", "–", "∞", "0.00123", "−2",
+    ]  # fmt: skip
+    assert [fixed(v, 2) for v in (None, 1.005, -1.0)] == ["–", "1.00", "−1.00"]
+    assert [percent(v) for v in (0, 1e-7, 0.0001234, 0.034, 0.567, 1)] == [
+        "0 %", "< 0.001 %", "0.012 %", "3.4 %", "57 %", "100 %",
+    ]  # fmt: skip
+
+
+def test_a_page_is_not_replaced_unasked_nor_left_half_written(tmp_path, monkeypatch):
+    root = ingested(tmp_path)
+    target = tmp_path / "report.html"
+    target.write_text("mine")
+    with pytest.raises(ValueError, match="already there"):
+        write_report(root, target)
+
+    def fail(*arguments):
+        raise OSError("no space")
+
+    monkeypatch.setattr(data_report, "render", fail)
+    with pytest.raises(OSError, match="no space"):
+        write_report(root, target, force=True)
+    assert target.read_text() == "mine"
+    assert not list(tmp_path.glob(".report*"))
+
+
+def test_targets_that_cannot_be_are_refused_before_any_work(tmp_path):
+    root = ingested(tmp_path)
+    with pytest.raises(ValueError, match="is a folder"):
+        write_report(root, tmp_path)
+    with pytest.raises(FileNotFoundError, match="none does not exist"):
+        write_report(root, tmp_path / "none" / "report.html")
+
+
+def test_frames_are_read_once(tmp_path, monkeypatch):
+    root = ingested(tmp_path)
+    read = []
+    plain = FrameSet.read
+
+    def counting(self, scene, index, *arguments, **options):
+        read.append((scene, index))
+        return plain(self, scene, index, *arguments, **options)
+
+    monkeypatch.setattr(FrameSet, "read", counting)
+    report(root, tmp_path)
+    assert sorted(read) == sorted(set(read))
+    assert len(read) == 4
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the shared development data")
+def test_the_rendered_stills_have_a_page_below_fifteen_megabytes(tmp_path):
+    from data.ingestion import IngestOptions, ingest
+
+    ingest("penumbra", SHARED, tmp_path / "set", IngestOptions(processes=2))
+    found, text = report(tmp_path / "set", tmp_path, processes=2)
+    assert len(text) < 15e6
+    assert [f.level for f in found if f.level == "problem"] == []
+    assert "same geometry and camera" in text  # matpreview-copper and matpreview-plastic
+    assert re.search(r"10 scenes do not state a licence", text)
+    Page(text)
+
+
+def test_frame_without_radiance_is_described_by_what_it_has(tmp_path):
+    base = sample_crop("classroom", 0)
+    bare = Frame({"depth": base.buffers["depth"]}, "x", 0, exposure=1.0)
+    facts = examine(FrameSet(made(tmp_path / "set", {"a": [bare], "b": levels()})))[0]
+    assert list(facts.thumbnails) == ["depth"]
+    assert facts.strip is None
+    Page(report(tmp_path / "set", tmp_path)[1])
