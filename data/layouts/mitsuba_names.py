@@ -1,4 +1,4 @@
-"""Names of AOVs in Mitsuba's films: what a channel is, by its letters and by the name that its user gave it."""
+"""Names in Mitsuba's films: what a channel is, by its letters and by the name that its user gave."""
 
 from __future__ import annotations
 
@@ -44,25 +44,27 @@ def roles_of(channels: Iterable[str]) -> Roles:
     roles = Roles({}, {}, {}, {}, [])
     geometric: list[str] = []
     for layer, letters in layers.items():
-        name, channel = layer.rpartition(".")[2], [letters[c] for c in sorted(letters)]
+        name, members = layer.rpartition(".")[2], [letters[c] for c in sorted(letters)]
         if layer.startswith(MOMENT):
             roles.moments[layer.removeprefix(MOMENT)] = letters
         elif {"R", "G", "B"} <= letters.keys():
-            channel = [letters[c] for c in "RGB"]
-            kind = "color" if not layer else "diffuse_albedo" if _ALBEDO.fullmatch(name) else ""
+            members = [letters[c] for c in "RGB"]
+            # Nested integrators write alpha too, the albedo AOV does not.
+            albedo = _ALBEDO.fullmatch(name) and "A" not in letters
+            kind = "color" if not layer else "diffuse_albedo" if albedo else ""
             if kind and kind not in roles.buffers:
-                roles.buffers[kind] = channel
+                roles.buffers[kind] = members
             else:
-                roles.nested[layer] = channel
+                roles.nested[layer] = members
         elif letters.keys() == {"X", "Y", "Z"}:
-            geometric += channel if _GEOMETRIC.fullmatch(name) else []
-            _vector(roles, layer, name, channel, MOMENT + layer in layers)
-        elif letters.keys() == {"T"} or (len(channel) == 1 and _DEPTH.fullmatch(name)):
-            roles.buffers.setdefault("depth", channel)
-        elif letters.keys() == {"Y"} and not layer:
-            roles.buffers["color"] = channel * 3
+            geometric += members if _GEOMETRIC.fullmatch(name) else []
+            _vector(roles, layer, name, members, MOMENT + layer in layers)
+        elif letters.keys() == {"T"} or (len(members) == 1 and _DEPTH.fullmatch(name)):
+            roles.buffers.setdefault("depth", members)
+        elif letters.keys() <= {"Y", "A"} and not layer:
+            roles.buffers["color"] = [letters.get("Y", members[0])] * 3
         else:
-            roles.ignored.extend(channel)
+            roles.ignored.extend(members)
     if geometric and "normal" not in roles.buffers:
         roles.buffers["normal"] = geometric[:3]
     return roles
