@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,10 +88,11 @@ def derive(
 ) -> Frame:
     """Return the frame with the named buffers added where they are absent.
 
-    albedo from diffuse_albedo and specular_albedo; irradiance = color / albedo; color = diffuse + specular,
-    irradiance * albedo; specular = color - diffuse and the reverse; depth from position and camera; motion
-    from position and both cameras; hit from depth; history 1 for frames that are not accumulated. Any buffer
-    is the mean of its halves of equal size, and either half is twice the mean less the other.
+    albedo, its halves and variance from diffuse_albedo and specular_albedo; irradiance = color / albedo;
+    color = diffuse + specular, or irradiance * albedo; specular = color - diffuse and the reverse; depth from
+    position and camera; motion from position and both cameras; hit from depth; history 1 for frames that are
+    not accumulated. Any buffer is the mean of its halves of equal size, and either half is twice the mean
+    less the other.
     `notes["derived"]` of the result records each with its rule.
 
     Args:
@@ -122,12 +124,13 @@ class _Context:
         self.variance_from_halves = variance_from_halves
         self.rules: dict[str, Callable[[], tuple[Image, str]]] = {
             "albedo": self._albedo,
+            **{f"albedo{part}": partial(self._albedo, part) for part in ("_a", "_b", "_variance")},
             "irradiance": self._irradiance,
             "color": self._color,
             "depth": self._depth,
             "motion": self._motion,
-            "diffuse": lambda: self._rest("diffuse", "specular"),
-            "specular": lambda: self._rest("specular", "diffuse"),
+            "diffuse": partial(self._rest, "diffuse", "specular"),
+            "specular": partial(self._rest, "specular", "diffuse"),
             "hit": self._hit,
             "history": self._history,
         }
@@ -169,12 +172,14 @@ class _Context:
             f"it has {', '.join(self.frame.buffers)}"
         )
 
-    def _albedo(self) -> tuple[Image, str]:
-        diffuse = self.frame.buffers.get("diffuse_albedo")
-        specular = self.frame.buffers.get("specular_albedo")
+    def _albedo(self, part: str = "") -> tuple[Image, str]:
+        diffuse = self.frame.buffers.get(f"diffuse_albedo{part}")
+        specular = self.frame.buffers.get(f"specular_albedo{part}")
         if diffuse is None:
-            raise self._fail("albedo", "diffuse_albedo (and specular_albedo)")
-        names = "diffuse_albedo" if specular is None else "diffuse_albedo + specular_albedo"
+            raise self._fail(f"albedo{part}", f"diffuse_albedo{part} (and specular_albedo{part})")
+        names = f"diffuse_albedo{part}" + ("" if specular is None else f" + specular_albedo{part}")
+        if part == "_variance":
+            return diffuse if specular is None else diffuse + specular, names
         return effective_albedo(diffuse, specular), f"{names}, 1 where 0, at least {ALBEDO_FLOOR}"
 
     def _irradiance(self) -> tuple[Image, str]:

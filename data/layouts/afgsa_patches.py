@@ -95,7 +95,7 @@ def _scene(root: Path, path: Path) -> Scene:
         sequence=False,
         credit="Xu et al. and Yu et al., ACFM and AFGSA data sets",
         provenance="AFGSA patches (doi:10.1145/3478513.3480565), Tungsten, "
-        f"{_spp(path)} spp, reference {reference} spp",
+        f"{_spp(path)} spp, reference {reference} spp; depth divided by the largest of its picture",
     )
 
 

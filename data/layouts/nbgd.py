@@ -6,7 +6,8 @@ frames) or, at 64 spp, `inputs/colorN.exr`, which is of one frame; `<scene>/dept
 is the depth scaled to the frame's range. `inputs/world_positionN.exr` and `camera_matrices.h` may be there
 as in BMFR; then depth follows from them and the picture is not read.
 
-Accumulated light counts first where both are there, since the layout's own loader reads that.
+Accumulated light counts first where both are there, since the layout's own loader reads that; as in BMFR, its
+exposure is 1.
 
 Source: Meng et al. 2020, doi:10.2312/sr.20201133.
 """
@@ -100,7 +101,8 @@ def read(folder: Path, scene: str, index: int) -> Frame:
             gathering.add(name, image, only_group(image))
     notes = {"normalised": ["depth"]} if "depth" in gathering.buffers else {}
     frame = gathering.frame(scene, index, None if accumulated else SPP, notes)
-    return replace(frame, camera=_camera(folder, index, frame), accumulated=accumulated, exposure=1.0)
+    frame.exposure = 1.0 if accumulated else None
+    return replace(frame, camera=_camera(folder, index, frame), accumulated=accumulated)
 
 
 def _sources(accumulated: bool, exact_depth: bool) -> dict[str, str]:
@@ -169,7 +171,8 @@ def _scene(root: Path, folder: Path) -> Scene:
         depth="z",
         credit="Meng et al., NBGD data set",
         provenance="NBGD data set (doi:10.2312/sr.20201133), "
-        + ("accumulated light" if accumulated else f"Tungsten, {SPP} spp"),
+        + ("accumulated light" if accumulated else f"Tungsten, {SPP} spp")
+        + ("" if exact else "; depth scaled to [0, 1] in each frame, 8 bits"),
     )
 
 

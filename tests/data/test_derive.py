@@ -182,3 +182,82 @@ def test_automatic_exposure_undoes_a_change_of_unit():
 
 def test_automatic_exposure_of_a_black_image_is_one():
     assert automatic_exposure(np.zeros((20, 20, 3), np.float32)) == 1.0
+
+
+def noisy(seed):
+    return np.random.default_rng(seed).gamma(0.5, 2.0, (4, 6, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["color", "normal", "diffuse_albedo", "specular"])
+def test_any_buffer_is_the_mean_of_its_halves(name):
+    halves = {f"{name}_a": noisy(1), f"{name}_b": noisy(2)}
+    frame = derive(frame_with(**halves), [name])
+    assert np.allclose(frame.buffers[name], (noisy(1) + noisy(2)) / 2)
+    assert frame.notes["derived"] == {name: f"mean of {name}_a and {name}_b"}
+
+
+@pytest.mark.parametrize(("there", "wanted"), [("a", "b"), ("b", "a")])
+def test_a_half_is_twice_the_mean_less_the_other(there, wanted):
+    a, b = noisy(1), noisy(2)
+    frame = frame_with(**{"color": (a + b) / 2, f"color_{there}": {"a": a, "b": b}[there]})
+    frame = derive(frame, [f"color_{wanted}"])
+    assert np.allclose(frame.buffers[f"color_{wanted}"], {"a": a, "b": b}[wanted], atol=1e-5)
+    assert frame.notes["derived"] == {f"color_{wanted}": f"2 * color - color_{there}"}
+
+
+def test_a_half_without_the_mean_is_simply_missing():
+    with pytest.raises(ValueError, match="missing buffer color_b; it has color_a"):
+        derive(frame_with(color_a=ONES), ["color_b"])
+
+
+def test_the_variance_of_the_mean_follows_from_the_halves_only_where_it_is_allowed():
+    generator = np.random.default_rng(5)
+    a, b = (generator.normal(3, 2, (200, 300, 3)) for _ in range(2))
+    frame = frame_with(color_a=a, color_b=b)
+    with pytest.raises(ValueError, match="missing buffer color_variance"):
+        derive(frame, ["color_variance"])
+    variance = derive(frame, ["color_variance"], variance_from_halves=True).buffers["color_variance"]
+    # Each half has the variance 4, so that their mean has 2.
+    assert variance.mean() == pytest.approx(2, rel=0.02)
+    assert variance.min() >= 0
+
+
+def test_the_variance_follows_from_the_mean_and_one_half_as_well():
+    a, b = noisy(1), noisy(2)
+    frame = derive(
+        frame_with(depth=(a + b)[..., :1] / 2, depth_a=a[..., :1]),
+        ["depth_variance"],
+        variance_from_halves=True,
+    )
+    assert np.allclose(frame.buffers["depth_variance"], ((a - b)[..., :1] / 2) ** 2, atol=1e-5)
+
+
+def test_a_variance_without_halves_is_missing_even_where_it_is_allowed():
+    with pytest.raises(ValueError, match="missing buffer normal_"):
+        derive(frame_with(normal=ONES), ["normal_variance"], variance_from_halves=True)
+
+
+def test_color_diffuse_and_specular_give_each_other():
+    parts = {"color": ONES * 3, "diffuse": ONES, "specular": ONES * 2}
+    for name in parts:
+        rest = {k: v for k, v in parts.items() if k != name}
+        assert (derive(frame_with(**rest), [name]).buffers[name] == parts[name]).all(), name
+
+
+def test_irradiance_follows_from_diffuse_and_specular():
+    frame = derive(frame_with(diffuse=ONES, specular=ONES, albedo=ONES / 2), ["irradiance"])
+    assert (frame.buffers["irradiance"] == 4).all()
+
+
+def test_visibility_has_no_rule():
+    with pytest.raises(ValueError, match="missing buffer visibility; it has color"):
+        derive(frame_with(color=ONES, depth=ONES[..., :1]), ["visibility"])
+
+
+@pytest.mark.parametrize("half", ["a", "b"])
+def test_halves_and_variance_of_the_albedo_follow_from_those_of_the_reflectance(half):
+    reflectance = np.where(np.arange(6)[:, None] < 2, np.float32(0), noisy(3) / 50)
+    names = {f"diffuse_albedo_{half}": reflectance, "diffuse_albedo_variance": noisy(4)}
+    frame = derive(frame_with(**names), [f"albedo_{half}", "albedo_variance"])
+    assert np.array_equal(frame.buffers[f"albedo_{half}"], effective_albedo(reflectance.astype(np.float32)))
+    assert np.array_equal(frame.buffers["albedo_variance"], noisy(4))
