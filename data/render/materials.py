@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from data.render.spec import Picture
-from data.render.textures import BRIGHTEST, random_colour, random_weights
+from data.render.textures import BRIGHTEST, muted, random_colour, random_weights
 
 Rng = np.random.Generator
 Plugin = dict[str, Any]
@@ -151,9 +151,17 @@ def random_material(rng: Rng, textures: Textures, glass: bool = False, kind: str
     return (OPAQUE | GLASS)[name][0](rng, textures)
 
 
-def surface_material(rng: Rng, textures: Textures) -> Plugin:
-    """Return a material for floors, walls and grounds: mostly matt, textured, none that is dark metal."""
-    colour = {"type": "bitmap", "picture": textures()} if rng.random() < 0.8 else _rgb(random_colour(rng))
+def surface_material(rng: Rng, textures: Textures, vividness: float = 1.0) -> Plugin:
+    """Return a material for floors, walls and grounds: mostly matt, textured, none that is metal.
+
+    Args:
+        rng: Source of all choices.
+        textures: Draws the colour textures that are used.
+        vividness: Saturation of a plain colour.
+    """
+    colour = _rgb(muted(random_colour(rng), vividness))
+    if rng.random() < 0.8:
+        colour = {"type": "bitmap", "picture": textures()}
     kind = rng.random()
     if kind < 0.6:
         return _twosided({"type": "diffuse", "reflectance": colour})

@@ -22,16 +22,18 @@ import numpy as np
 
 from data.render.assets import Assets, file_hash, read_environment, read_mesh, read_texture
 from data.render.backdrops import random_backdrop
+from data.render.blur import choose_motion, with_lens
 from data.render.lights import room_lights
 from data.render.materials import random_material, surface_material
 from data.render.placement import Layout, Region, Surroundings, place
 from data.render.room_kinds import ROOMS, random_room
 from data.render.shapes import FAMILIES, random_family, random_mesh
+from data.render.sketch import Sketch
 from data.render.skies import random_sky, scaled
 from data.render.spec import Mesh, Picture, SceneSpec, Shot, View
 from data.render.surfaces import affine, rotation
 from data.render.textures import random_texture
-from data.render.viewpoints import Sketch, choose_motion, choose_path, choose_view, with_lens
+from data.render.viewpoints import choose_path, choose_view
 
 Rng = np.random.Generator
 Kind = Literal["outdoor", "indoor"]
@@ -41,7 +43,7 @@ GENERATOR_VERSION = 1
 """Part of every scene's origin; raised whenever a seed would give another scene."""
 
 OBJECTS = {"outdoor": 75, "indoor": 50}
-EXPOSURE = {"outdoor": 0.6, "indoor": 0.8}
+EXPOSURE = {"outdoor": 0.6, "indoor": 1.3}
 MATERIALS = 24
 GLASSES = 3
 MAX_TRIANGLES = 500_000
@@ -86,12 +88,12 @@ class _Source:
             return self._read[path]
         raise ValueError(f"{_TRIES} of your own files in a row could not be used; the last: {said}")
 
-    def texture(self, part: str, number: int) -> Callable[[], Picture]:
+    def texture(self, part: str, number: int, vividness: float = 1.0) -> Callable[[], Picture]:
         """Return what draws colour textures for a part of the scene."""
         rng = self.stream(f"texture of {part}", number)
 
         def draw() -> Picture:
-            return self.asset(rng, self.assets.textures, read_texture) or random_texture(rng)
+            return self.asset(rng, self.assets.textures, read_texture) or random_texture(rng, None, vividness)
 
         return draw
 
@@ -179,7 +181,9 @@ def _level(source: _Source) -> float:
 
 
 def _surface(source: _Source, part: str) -> dict[str, Any]:
-    return surface_material(source.stream(f"surface {part}"), source.texture(part, 0))
+    rng = source.stream(f"surface {part}")
+    vividness = 1.0 if rng.random() < 0.4 else float(rng.uniform(0.1, 0.6))
+    return surface_material(rng, source.texture(part, 0, vividness), vividness)
 
 
 def _materials(source: _Source) -> dict[str, Any]:
@@ -230,7 +234,7 @@ def _indoor(source: _Source) -> tuple[dict[str, Any], Sketch]:
     room = random_room(rng, list(ROOMS)[int(rng.integers(len(ROOMS)))])
     low, high = room.bounds
     layout = Layout()
-    region = Region(low[[0, 2]], high[[0, 2]], False, 0.6 * room.height, (0.1, 0.55))
+    region = Region(low[[0, 2]], high[[0, 2]], False, 0.6 * room.height, (0.12, 0.6))
     content = _materials(source)
     content |= _objects(source, region, room, layout)
     for name, mesh in room.parts.items():

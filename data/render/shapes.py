@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.render import implicit, solids, swept
+from data.render import implicit, sheets, solids, swept
 from data.render.spec import Mesh
 from data.render.surfaces import normalised
 
@@ -48,9 +48,9 @@ FAMILIES: dict[str, Family] = {
     "gear": Family(solids.gear),
     "rock": Family(solids.rock),
     "fragments": Family(solids.fragments, closed=False),
-    "plate": Family(solids.plate, weight=0.7),
-    "blades": Family(solids.blades, closed=False),
-    "terrain": Family(solids.terrain, weight=0.5),
+    "plate": Family(sheets.plate, weight=0.7),
+    "blades": Family(sheets.blades, closed=False),
+    "terrain": Family(sheets.terrain, weight=0.5),
     "towers": Family(solids.towers, closed=False, weight=0.7),
 }
 """Name → family, 22 of them."""

@@ -204,15 +204,22 @@ def random_pattern(rng: Rng, kind: str | None = None) -> Floats:
     return np.clip(PATTERNS[name](rng, size), 0, 1)
 
 
-def random_texture(rng: Rng, kind: str | None = None) -> Picture:
+def muted(colours: Floats, vividness: float) -> Floats:
+    """Return colours (..., 3) drawn towards their grey; 1 keeps them, 0 leaves grey."""
+    grey = colours.mean(-1, keepdims=True)
+    return grey + vividness * (colours - grey)
+
+
+def random_texture(rng: Rng, kind: str | None = None, vividness: float = 1.0) -> Picture:
     """Return a colour texture (size, size, 3), linear, within [0.02, 0.9].
 
     Args:
         rng: Source of all choices.
         kind: A name of `PATTERNS`; None: any.
+        vividness: Saturation of the palette, 1: as drawn.
     """
     value = random_pattern(rng, kind)
-    palette = random_palette(rng)
+    palette = muted(random_palette(rng), vividness)
     stops = np.linspace(0, 1, len(palette))
     if rng.random() < 0.25:
         number = np.minimum((value * len(palette)).astype(int), len(palette) - 1)

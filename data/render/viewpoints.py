@@ -1,126 +1,22 @@
-"""Cameras of random scenes: views that show the objects, paths that touch nothing, lenses, moving objects.
-
-Scenes are judged by a sketch of them: bounding spheres in their surroundings, met by a few rays per view.
-"""
+"""Cameras of random scenes: views that show the objects, and paths that touch nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from data.render.placement import Layout, Surroundings
+from data.render.sketch import Seen, Sketch, focal, look_at, project, rays
 from data.render.spec import Shot, View
 from data.render.surfaces import affine, rotation, unit
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
-SHRUNK = 0.7
-"""Most things fill about this part of their bounding spheres' radius."""
-
-FAR = 80.0
 GAP = 0.2
 """Distance that a camera keeps from everything."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What a view shows in the sketch.
-
-    Attributes:
-        distance: Along each ray (N,), inf: nothing.
-        thing: Number of the thing that each ray meets (N,), -1: the surroundings or nothing.
-        directions: Of the rays (N, 3).
-    """
-
-    distance: Floats
-    thing: NDArray[np.int64]
-    directions: Floats
-
-
-@dataclass(frozen=True)
-class Sketch:
-    """A scene as its bounding spheres and its surroundings.
-
-    Attributes:
-        layout: The spheres.
-        around: Room or ground.
-        things: How many of the spheres, the first ones, are objects; the rest are lights.
-        region: Low and high corner (3,) of where a camera may be; None: anywhere around the objects.
-        facing: Direction of the side from which the scene is seen (3,); None: from all.
-    """
-
-    layout: Layout
-    around: Surroundings
-    things: int
-    region: tuple[Floats, Floats] | None = None
-    facing: Floats | None = None
-
-    def free(self, points: Floats, shift: Floats | None = None) -> Floats:
-        """Return the distance from points (N, 3) to everything.
-
-        Args:
-            points: Positions.
-            shift: Displacement of each thing at each point (N, K, 3).
-        """
-        centres = self.layout.centres[None] + (0 if shift is None else shift)
-        near = np.linalg.norm(points[:, None] - centres, axis=2) - self.layout.radii
-        return np.minimum(near.min(1, initial=np.inf), self.around.clearance(points))
-
-    def trace(self, origin: Floats, directions: Floats, shrunk: float = SHRUNK) -> Seen:
-        """Return what rays from a point (3,) along directions (N, 3) meet."""
-        away = self.layout.centres - origin
-        along = directions @ away.T
-        squared = (away**2).sum(1) - along**2
-        half = (self.layout.radii * shrunk) ** 2 - squared
-        hit = (half > 0) & (along > 0)
-        t = np.where(hit, along - np.sqrt(np.maximum(half, 0)), np.inf)
-        thing = t.argmin(1)
-        nearest = np.maximum(t.min(1), 1e-3)
-        ground, going = np.full(len(directions), 0.05), np.arange(len(directions))
-        for _ in range(32):
-            step = self.around.clearance(origin + ground[going, None] * directions[going])
-            ground[going] = np.minimum(ground[going] + np.maximum(step, 0.0), FAR)
-            going = going[(step > 0.02) & (ground[going] < np.minimum(nearest[going], FAR))]
-            if not len(going):
-                break
-        ground = np.where(ground >= FAR, np.inf, ground)
-        thing = np.where(np.isfinite(nearest) & (nearest < ground), thing, -1)
-        return Seen(np.minimum(nearest, ground), thing, directions)
-
-
-def look_at(origin: Floats, target: Floats, roll: float = 0.0) -> Floats:
-    """Return the camera matrix 4x4 of a camera that looks at a target: +Z ahead, +X to the left, +Y up."""
-    ahead = unit(target - origin)
-    left = unit(np.cross(np.array([0.0, 1.0, 0.0]), ahead))
-    matrix = affine(np.stack([left, np.cross(ahead, left), ahead], 1), origin)
-    matrix[:3, :3] = rotation(ahead, roll) @ matrix[:3, :3]
-    return matrix
-
-
-def focal(view: View) -> float:
-    """Return the focal length in pixels."""
-    return view.width / (2 * np.tan(np.radians(view.fov) / 2))
-
-
-def rays(view: View, columns: int = 16) -> Floats:
-    """Return the directions (N, 3) of a coarse grid of rays over the view."""
-    rows = max(2, round(columns * view.height / view.width))
-    x = (np.arange(columns) + 0.5) / columns * view.width - view.width / 2
-    y = (np.arange(rows) + 0.5) / rows * view.height - view.height / 2
-    local = np.stack([*np.meshgrid(-x / focal(view), -y / focal(view)), np.ones((rows, columns))], -1)
-    return unit(local.reshape(-1, 3)) @ view.to_world[:3, :3].T
-
-
-def project(view: View, points: Floats) -> Floats:
-    """Return pixels (N, 2) of points (N, 3); those behind the camera become NaN."""
-    local = (points - view.to_world[:3, 3]) @ view.to_world[:3, :3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = -local[:, :2] / local[:, 2:] * focal(view) + [view.width / 2, view.height / 2]
-    return np.where(local[:, 2:] > 1e-6, pixel, np.nan)
 
 
 def score(seen: Seen, rng: Rng) -> float:
@@ -154,7 +50,7 @@ def _candidate(rng: Rng, sketch: Sketch, shot: Shot) -> View | None:
     return View(look_at(origin, aim, roll), float(rng.uniform(25, 75)), shot.width, shot.height)
 
 
-def choose_view(rng: Rng, sketch: Sketch, shot: Shot, tries: int = 14) -> View:
+def choose_view(rng: Rng, sketch: Sketch, shot: Shot, tries: int = 20) -> View:
     """Return the best of several random cameras; none touches anything.
 
     Raises:
@@ -264,57 +160,3 @@ def _good_path(sketch: Sketch, views: tuple[View, ...], pan: bool) -> bool:
         if not 0.8 <= moved <= 4.5:
             return False
     return True
-
-
-def with_lens(rng: Rng, sketch: Sketch, view: View) -> View:
-    """Return the view through a lens focused on one of the things in it.
-
-    The circle of confusion of a point at infinity is 4 to 30 pixels in an image 256 pixels wide.
-    """
-    seen = sketch.trace(view.to_world[:3, 3], rays(view))
-    things = np.flatnonzero(seen.thing >= 0)
-    ray = int(rng.choice(things)) if len(things) else int(rng.integers(len(seen.distance)))
-    cosine = float(seen.directions[ray] @ view.to_world[:3, 2])
-    focus = float(np.clip(min(seen.distance[ray], FAR) * cosine, 0.3, FAR))
-    diameter = np.exp(rng.uniform(np.log(4), np.log(30))) * view.width / 256
-    aperture = min(float(diameter * focus / (2 * focal(view))), 0.12)
-    return replace(view, aperture=aperture, focus=focus)
-
-
-def choose_motion(
-    rng: Rng, sketch: Sketch, views: tuple[View, ...], path: bool
-) -> dict[int, tuple[float, float, float]]:
-    """Return displacements over one shutter (3,) of a random part of the things, by their numbers.
-
-    In a still they are 3 to 40 pixels at an image width of 256, as the first camera sees them; along a path,
-    where every frame adds one, 0.5 to 4 pixels. What would leave the room or hit a camera stays.
-    """
-    layout, view, frames = sketch.layout, views[0], len(views)
-    share, result = rng.uniform(0.1, 0.6), {}
-    depth = (layout.centres - view.to_world[:3, 3]) @ view.to_world[:3, 2]
-    times = np.linspace(-0.5, frames - 0.5, 2 * frames + 1)
-    cameras = np.stack([v.to_world[:3, 3] for v in views])
-    for k in range(sketch.things):
-        moves, way = (
-            rng.random() < share,
-            unit(rng.normal(size=3) * [1, 0.15 if rng.random() < 0.7 else 1, 1]),
-        )
-        low, high = (0.5, 4.0) if path else (3.0, 40.0)
-        pixels = np.exp(rng.uniform(np.log(low), np.log(high))) * (1 if path else view.width / 256)
-        if not moves:
-            continue
-        length = min(pixels * max(depth[k], 1.0) / focal(view), 1.5, 4.0 / frames)
-        shift = way * length
-        centre, radius = layout.centres[k], layout.radii[k]
-        along = centre + times[:, None] * shift
-        if sketch.around.clearance(along, floor=False).min() < 0.5 * radius:
-            continue
-        if (along[:, 1] < sketch.around.floor(along[:, [0, 2]]) + 0.2 * radius).any():
-            continue
-        # The camera of frame i is open from i - 0.5 to i + 0.5, while the thing moves on.
-        open_at = np.arange(frames)[:, None] + np.array([-0.5, 0.0, 0.5])
-        at = centre + open_at[..., None] * shift
-        if (np.linalg.norm(at - cameras[:, None], axis=2) < radius + GAP).any():
-            continue
-        result[k] = (float(shift[0]), float(shift[1]), float(shift[2]))
-    return result
