@@ -95,8 +95,9 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
     for key, value in (("repaired", repaired), ("ignored", ignored), ("outside_data_window", outside)):
         if value:
             frame.notes[key] = value
-    for name, array in buffers.items():
-        _warn_unless_radiance(path, name, array)
+    if _MARK not in image.attributes:  # our own files were looked at when they were made
+        for name, array in buffers.items():
+            _warn_unless_radiance(path, name, array)
     return frame
 
 

@@ -113,6 +113,7 @@ def render(
         OSError: The output cannot be written, or the disk has too little room.
     """
     root = Path(output)
+    plan(sources, recipe, root)  # what is wrong with the scenes is said before anything is touched
     splits = _splits([source.name for source in sources], options)
     _prepare_output(root, recipe, options.force)
     todo = plan(sources, recipe, root)
@@ -246,24 +247,23 @@ def _work(sources: Sequence[Source], todo: Plan, options: RenderOptions, progres
     tasks = list(_tasks(sources, todo, options.processes))
     done, began = todo.samples - todo.missing, time.monotonic()
     context = multiprocessing.get_context("spawn")  # the renderer keeps threads, which no fork survives
-    with context.Manager() as manager:
-        reports = manager.Queue()
-        pool = ProcessPoolExecutor(
-            min(options.processes, len(tasks)),
-            mp_context=context,
-            initializer=start,
-            initargs=(options.variant, options.threads, reports, os.getpid()),
-        )
-        try:
-            pending = [pool.submit(render_task, task) for task in tasks]
-            for count, label in _reports(reports, pending):
-                done += count
-                if progress is not None:
-                    progress(done, todo.samples, label)
-            pool.shutdown()
-        except BaseException:
-            _end(pool)
-            raise
+    reports = context.Queue()
+    pool = ProcessPoolExecutor(
+        min(options.processes, len(tasks)),
+        mp_context=context,
+        initializer=start,
+        initargs=(options.variant, options.threads, reports, os.getpid()),
+    )
+    try:
+        pending = [pool.submit(render_task, task) for task in tasks]
+        for count, label in _reports(reports, pending):
+            done += count
+            if progress is not None:
+                progress(done, todo.samples, label)
+        pool.shutdown()
+    except BaseException:
+        _end(pool)
+        raise
     seconds = max(time.monotonic() - began, 1e-3)
     if todo.missing:
         root = next(iter(todo.works.values()))[0].root

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -28,14 +29,14 @@ class _Process:
     """What a process was told when it started."""
 
     reports: Any = None
-    parent: int = 0
     renderer: str = ""
 
 
 def start(variant: Variant, threads: int, reports: Any, parent: int) -> None:
-    """Prepare a process: choose the renderer's variant and its threads."""
+    """Prepare a process: choose the renderer's variant and its threads, and end when the parent ends."""
+    threading.Thread(target=_follow, args=(parent,), daemon=True).start()
     activate(variant, threads)
-    _Process.reports, _Process.parent = reports, parent
+    _Process.reports = reports
     _Process.renderer = f"Mitsuba {version('mitsuba')} ({variant.name})"
 
 
@@ -72,7 +73,12 @@ def speed_of(source: Source, recipe: Recipe) -> float:
 
 
 def _report(count: int, label: str) -> None:
-    """Tell the parent; end with it, so that a killed command leaves nothing behind that renders."""
-    if os.getppid() != _Process.parent:
-        os._exit(1)
+    """Tell the parent what was done."""
     _Process.reports.put((count, label))
+
+
+def _follow(parent: int) -> None:
+    """End this process when its parent is gone, so that a killed command leaves nothing that renders."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)

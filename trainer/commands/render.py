@@ -99,10 +99,13 @@ def run(args: argparse.Namespace) -> int:
     """
     from data.render.rendering import RenderOptions, render
     from data.render.variant import choose
+    from trainer.configs import UsageError
     from trainer.progress import sample_progress
 
     recipe = _recipe(args)
     sources = _sources(args, recipe)
+    if not sources:
+        raise UsageError("nothing to render: give --random N or --scene FILE")
     variant = choose(VARIANTS[args.variant])
     print(f"Mitsuba's variant: {variant.reason}", flush=True)
     cores = len(os.sched_getaffinity(0))

@@ -1,0 +1,205 @@
+"""`trainer render` with the real renderer, on tiny images and one simple scene each."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data.camera import motion
+from data.frames import FrameSet
+from data.render.references import ENERGY_LIMIT
+from trainer.cli import main
+
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective">
+    <float name="fov" value="45"/>
+    <transform name="to_world"><lookat origin="0, 1, 4" target="0, 0.5, 0" up="0, 1, 0"/></transform>
+  </sensor>
+  <shape type="rectangle">
+    <transform name="to_world"><rotate x="1" angle="-90"/><scale value="4"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.4, 0.2"/></bsdf>
+  </shape>
+  <shape type="sphere">
+    <point name="center" x="0" y="0.6" z="0"/><float name="radius" value="0.6"/>
+    <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.2, 0.5, 0.7"/></bsdf>
+  </shape>
+  <emitter type="constant"><rgb name="radiance" value="0.8, 0.9, 1"/></emitter>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    folder = tmp_path / "ball"
+    folder.mkdir()
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "LICENSE").write_text("CC0-1.0\n")
+    return folder / "scene.xml"
+
+
+def command(kind, scene, output, *more):
+    size = ("--size", "24x16", "--reference-spp", "16", "--processes", "1")
+    return [str(a) for a in ("render", kind, "--scene", scene, "--output", output, *size, *more)]
+
+
+def run(monkeypatch, arguments):
+    monkeypatch.setattr(sys, "argv", ["trainer", *arguments])
+    return main()
+
+
+def test_stills_of_a_file_become_a_data_set_whose_energy_agrees(scene, tmp_path, monkeypatch, capsys):
+    output = tmp_path / "set"
+    assert run(monkeypatch, command("stills", scene, output, "--spp", 4, 8, "--frames", 2)) == 0
+    frames = FrameSet(output)
+    assert frames.check() == []
+    records = frames.frames("ball")
+    assert [(r.index, r.view, r.spp) for r in records] == [(0, 0, 4), (1, 0, 8), (2, 1, 4), (3, 1, 8)]
+    assert all(abs(r.checks["energy_z"]) < ENERGY_LIMIT for r in records)
+    frame = frames.read("ball", 1)
+    assert {
+        "color",
+        "color_a",
+        "albedo",
+        "irradiance",
+        "reference",
+        "reference_diffuse",
+    } <= frame.buffers.keys()
+    assert np.allclose(np.median(frame.buffers["normal"][-1], 0), (0, 1, 0), atol=1e-3)
+    assert not frames.manifest.scenes["ball"].sequence
+    assert "CC0-1.0" in frames.manifest.scenes["ball"].license
+    out = capsys.readouterr().out
+    assert "standard errors" in out
+    assert "next: trainer inspect" in out
+
+
+def test_a_sequence_reprojects_onto_its_preceding_frame(scene, tmp_path, monkeypatch):
+    output = tmp_path / "set"
+    assert run(monkeypatch, command("sequences", scene, output, "--frames", 3)) == 0
+    frames = FrameSet(output)
+    assert frames.manifest.scenes["ball"].sequence
+    assert frames.manifest.depth == "euclidean"
+    stored = [frames.read("ball", i) for i in range(3)]
+    assert (stored[0].buffers["motion"] == 0).all()
+    derived = list(frames.sequence("ball", ["color", "position", "motion"]))
+    for previous, frame in itertools.pairwise(derived):
+        exact = motion(frame.buffers["position"], frame.camera, previous.camera)
+        hit = frame.buffers["hit"][..., 0] == 1
+        assert np.abs(exact - frame.buffers["motion"])[hit].max() < 0.02
+        assert np.abs(frame.buffers["motion"][hit]).max() > 0.05
+
+
+def test_samples_are_kept_apart_with_twenty_numbers(scene, tmp_path, monkeypatch):
+    output = tmp_path / "set"
+    assert run(monkeypatch, command("samples", scene, output, "--spp", 4)) == 0
+    frame = FrameSet(output).read("ball", 0)
+    assert (frame.samples.count, len(frame.samples.channels)) == (4, 20)
+    assert frame.spp == 4
+
+
+def test_a_finer_reference_is_added_to_what_is_there(scene, tmp_path, monkeypatch):
+    output = tmp_path / "set"
+    arguments = command("sequences", scene, output, "--frames", 1)
+    run(monkeypatch, arguments)
+    before = FrameSet(output).read("ball", 0)
+    run(monkeypatch, [*arguments, "--reference-spp", "48"])
+    after = FrameSet(output).read("ball", 0)
+    assert np.array_equal(before.buffers["color"], after.buffers["color"])
+    assert not np.array_equal(before.buffers["reference"], after.buffers["reference"])
+    assert FrameSet(output).frames("ball")[0].reference_spp == 48
+
+
+def test_another_recipe_in_the_same_folder_is_refused_and_loses_nothing(scene, tmp_path, monkeypatch, capsys):
+    output = tmp_path / "set"
+    run(monkeypatch, command("sequences", scene, output, "--frames", 1))
+    before = FrameSet(output).manifest.hash
+    assert run(monkeypatch, command("stills", scene, output, "--spp", 4)) == 1
+    assert "another recipe" in capsys.readouterr().err
+    assert run(monkeypatch, command("sequences", scene, output, "--frames", 2)) == 1
+    assert "--force" in capsys.readouterr().err
+    assert FrameSet(output).manifest.hash == before
+    assert FrameSet(output).check() == []
+
+
+def test_a_dry_run_says_what_would_be_rendered_and_writes_nothing(scene, tmp_path, monkeypatch, capsys):
+    output = tmp_path / "set"
+    assert run(monkeypatch, [*command("stills", scene, output, "--spp", 4), "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert "1 scenes, 1 views, 1 frames of 24x16" in out
+    assert "samples per second" in out
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "give --random N or --scene FILE"),
+        (["--random", "1", "--size", "24"], "columns x rows"),
+        (["--random", "1", "--spp", "3"], "must be even"),
+        (["--random", "1", "--defocus", "2"], "from 0 to 1"),
+        (["--random", "1", "--memory", "0.1"], "at least 0.5 GB"),
+        (["--scene", "missing.xml"], "missing.xml"),
+    ],
+)
+def test_wrong_options_are_named_before_anything_is_rendered(tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, ["render", "stills", "--output", "set", *options]) in (1, 2)
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_broken_scene_is_one_line_with_the_file(scene, tmp_path, monkeypatch, capsys):
+    scene.write_text(SCENE.replace("roughplastic", "plasticine"))
+    assert run(monkeypatch, command("stills", scene, tmp_path / "set", "--spp", 4)) == 1
+    err = capsys.readouterr().err
+    assert "scene.xml" in err
+    assert "plasticine" in err
+
+
+def children(pid):
+    return [int(p) for p in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_killed_it_goes_on_to_the_same_data_set_and_its_processes_end(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CACHE", os.environ.get("PENUMBRA_CACHE", str(tmp_path / "cache")))
+    arguments = command("stills", scene, tmp_path / "killed", "--spp", 4, "--frames", 4)
+    process = subprocess.Popen([sys.executable, "-m", "trainer", *arguments], stderr=subprocess.DEVNULL)
+    views = tmp_path / "killed" / ".render" / "views"
+    deadline = time.monotonic() + 120
+    while not (views.is_dir() and len(list(views.glob("*.json"))) >= 2):
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    below = children(process.pid)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "manifest.json").exists()
+    assert run(monkeypatch, arguments) == 0
+    run(monkeypatch, command("stills", scene, tmp_path / "whole", "--spp", 4, "--frames", 4))
+    a, b = FrameSet(tmp_path / "killed").manifest, FrameSet(tmp_path / "whole").manifest
+    assert [r.sha256 for r in a.scenes["ball"].frames] == [r.sha256 for r in b.scenes["ball"].frames]
+    while any(running(pid) for pid in below):
+        assert time.monotonic() < deadline, "a process of the killed command still runs"
+        time.sleep(0.05)
+
+
+def test_the_manifest_says_how_to_make_the_set_again(scene, tmp_path, monkeypatch):
+    run(monkeypatch, command("samples", scene, tmp_path / "set", "--spp", 2))
+    manifest = json.loads((tmp_path / "set" / "manifest.json").read_text())
+    recipe = manifest["recipe"]["recipe"]
+    assert (recipe["kind"], recipe["spp"], recipe["reference_spp"]) == ("samples", [2], 16)
+    assert manifest["scenes"]["ball"]["origin"]
+    assert "Mitsuba" in manifest["scenes"]["ball"]["provenance"]
