@@ -41,7 +41,7 @@ class Planes:
 
     Args:
         name: The buffer, for messages.
-        values: float32 (C, H, W), or (S, C, H, W) of samples.
+        values: float32 (C, H, W), or (S, C, H, W) of samples, in any memory order.
         half: Half precision is allowed.
 
     Raises:
@@ -59,12 +59,12 @@ class Planes:
         self._half: NDArray[np.float16] | None = None
         if half:
             with np.errstate(over="ignore"):  # a patch with such a value is taken from `values`
-                self._half = values.astype("<f2")
+                self._half = values.astype("<f2", order="C")
 
     @staticmethod
     def of(name: str, image: Image) -> Planes:
         """Return the planes of a buffer (H, W, C)."""
-        return Planes(name, _channel_first(image), buffer(name).half)
+        return Planes(name, image.transpose(2, 0, 1), buffer(name).half)
 
     @staticmethod
     def of_samples(samples: Samples, half: bool) -> Planes:
@@ -106,13 +106,6 @@ class Planes:
 def _in_range(array: NDArray[np.float32]) -> bool:
     largest = float(max(array.max(initial=0), -array.min(initial=0)))
     return largest == 0.0 or HALF_FLOOR <= largest <= HALF_MAX
-
-
-def _channel_first(image: Image) -> NDArray[np.float32]:
-    planes = np.empty((image.shape[2], *image.shape[:2]), np.float32)
-    for channel, plane in enumerate(planes):
-        plane[...] = image[..., channel]
-    return planes
 
 
 def _window(array: Stored, position: Position | None, patch: int) -> Stored:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -44,8 +45,20 @@ def describe(arrays: Mapping[str, Stored]) -> tuple[list[dict[str, Any]], int]:
 
 
 def header(name: str, size: int) -> bytes:
-    """Return the header of a tar member, without time, owner or other traces of the machine."""
-    info = tarfile.TarInfo(name)
+    """Return the header of a tar member, without time, owner or other traces of the machine.
+
+    The name goes into a template, which is several times faster than making each header anew.
+    """
+    made = bytearray(_template(size))
+    made[: len(name)] = name.encode("ascii")
+    made[148:156] = b" " * 8  # where the checksum goes, which counts it as blanks
+    made[148:156] = b"%06o\0 " % sum(made)
+    return bytes(made)
+
+
+@functools.lru_cache(maxsize=64)
+def _template(size: int) -> bytes:
+    info = tarfile.TarInfo("")
     info.size = size
     info.mode = 0o644
     return info.tobuf(tarfile.USTAR_FORMAT)
