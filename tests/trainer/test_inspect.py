@@ -167,3 +167,63 @@ def test_paths_that_hold_nothing_known_are_refused_with_what_was_expected(tmp_pa
     (tmp_path / "set" / ".partial").mkdir(parents=True)
     with pytest.raises(ValueError, match="is an unfinished ingestion; run the same `trainer ingest` command"):
         call(tmp_path / "set")
+
+
+def test_a_page_is_written_and_its_place_and_findings_printed(tmp_path, capsys):
+    target = tmp_path / "report.html"
+    assert call(ingested(tmp_path), "--html", target, "--processes", 1) == 0
+    printed = capsys.readouterr()
+    assert "warning: 2 scenes do not state a licence" in printed.out
+    assert f"{target}: " in printed.out
+    assert "open it in a browser" in printed.out
+    assert "frames: 4 of 4" in printed.err
+    assert target.read_text(encoding="utf-8").startswith("<!doctype html>")
+
+
+def test_findings_are_printed_as_json_alone_on_standard_output(tmp_path, capsys):
+    assert call(ingested(tmp_path), "--html", tmp_path / "r.html", "--json", "--processes", 1) == 0
+    printed = capsys.readouterr()
+    levels = {f["level"]: f["text"] for f in json.loads(printed.out)}
+    assert "licence" in levels["warning"]
+    assert "open it in a browser" in printed.err
+
+
+def test_a_page_of_a_set_with_a_damaged_frame_is_written_and_the_command_fails(tmp_path, capsys):
+    root = ingested(tmp_path)
+    (root / "classroom" / "f001.exr").write_bytes(b"x")
+    assert call(root, "--html", tmp_path / "r.html", "--processes", 1) == 1
+    assert "problem: 1 frame cannot be read" in capsys.readouterr().out
+    assert "f001.exr has 1 bytes" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_an_existing_page_is_replaced_only_with_force(tmp_path):
+    root, target = ingested(tmp_path), tmp_path / "r.html"
+    target.write_text("mine")
+    with pytest.raises(ValueError, match=r"already there .*--force replaces"):
+        call(root, "--html", target)
+    assert target.read_text() == "mine"
+    assert call(root / "manifest.json", "--html", target, "--force", "--processes", 1) == 0
+    assert target.read_text(encoding="utf-8") != "mine"
+
+
+def test_a_page_is_refused_for_what_is_no_data_set_with_the_way_to_one(tmp_path):
+    target = ("--html", tmp_path / "r.html")
+    with pytest.raises(ValueError, match=r"holds shards.*name the one that they were prepared from"):
+        call(shards(tmp_path / "s"), *target)
+    penumbra_scene(tmp_path / "p", "classroom")
+    with pytest.raises(ValueError, match=r"has the layout penumbra.*ingest it first, with --layout penumbra"):
+        call(tmp_path / "p", *target)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"is no data set \(it has no manifest\.json\)"):
+        call(tmp_path / "empty", *target)
+    with pytest.raises(FileNotFoundError, match="none does not exist"):
+        call(tmp_path / "none", *target)
+    with pytest.raises(ValueError, match="--processes is 0"):
+        call(tmp_path, "--processes", 0, *target)
+    assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.parametrize("option", [("--force",), ("--processes", 2)])
+def test_options_of_the_page_are_refused_without_it(tmp_path, option):
+    with pytest.raises(ValueError, match=f"{option[0]} is for --html"):
+        call(tmp_path, *option)

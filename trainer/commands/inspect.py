@@ -43,6 +43,9 @@ def run(args: argparse.Namespace) -> int:
     path = _resolve(args.path)
     if args.html is not None:
         return _write_page(path, args)
+    for name in ("processes", "force"):
+        if getattr(args, name):
+            raise ValueError(f"--{name} is for --html FILE, which is not given")
     found = inspect_path(path)
     if args.json:
         print(json.dumps(found, indent=1, ensure_ascii=False))

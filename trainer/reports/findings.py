@@ -153,9 +153,10 @@ def _broken_values(facts: Sequence[FrameFacts]) -> list[Finding]:
         text = f"radiance of {_frames(len(encoded))} looks 8-bit or tone-mapped; linear radiance is expected"
         lines = _lines(encoded, lambda f: "; ".join(f"{n} {why}" for n, why in f.encoded.items()))
         found.append(Finding("warning", text, _where(encoded), lines))
-    outside = [f for f in facts if f.outside]
+    # Normals have a line of their own.
+    outside = [f for f in facts if f.outside.keys() - {"normal"}]
     if outside:
-        names = ", ".join(dict.fromkeys(n for f in outside for n in f.outside))
+        names = ", ".join(dict.fromkeys(n for f in outside for n in f.outside if n != "normal"))
         text = f"{names}: values outside of the legal range in {_frames(len(outside))}"
         lines = _lines(outside, lambda f: ", ".join(f"{percent(s)} of {n}" for n, s in f.outside.items()))
         found.append(Finding("warning", text, _where(outside), lines))
