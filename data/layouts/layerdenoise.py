@@ -70,9 +70,8 @@ def describe(root: str | Path) -> list[Scene]:
     """Return one scene per pair of files below a root, sorted by name.
 
     Raises:
-        ModuleNotFoundError: h5py is not installed.
         OSError: The root does not exist.
-        ValueError: No input file, a data set that is missing, hostile or of another shape, or a reference
+        ValueError: h5py is not installed, no input file, a data set that is missing, hostile or of another shape, or a reference
             that does not fit; names file and data set.
     """
     root = Path(root)
@@ -95,9 +94,8 @@ def read(scene: str, path: Path, reference: Path | None, index: int) -> Frame:
     """Read one frame, and nothing else, from its files.
 
     Raises:
-        ModuleNotFoundError: h5py is not installed.
         OSError: A file is missing.
-        ValueError: A data set is missing, hostile, damaged or of another shape.
+        ValueError: h5py is not installed, or a data set is missing, hostile, damaged or of another shape.
     """
     with open_hdf5(path) as file:
         raw = {name: _last(items(_input(file, path, name), index)) for name in _CHANNELS}

@@ -61,8 +61,8 @@ def roles_of(channels: Iterable[str]) -> Roles:
             _vector(roles, layer, name, members, MOMENT + layer in layers)
         elif letters.keys() == {"T"} or (len(members) == 1 and _DEPTH.fullmatch(name)):
             roles.buffers.setdefault("depth", members)
-        elif letters.keys() <= {"Y", "A"} and not layer:
-            roles.buffers["color"] = [letters.get("Y", members[0])] * 3
+        elif not layer and "Y" in letters and letters.keys() <= {"Y", "A"}:
+            roles.buffers["color"] = [letters["Y"]] * 3
         else:
             roles.ignored.extend(members)
     if geometric and "normal" not in roles.buffers:

@@ -16,7 +16,7 @@ _TOLERANCE = 1e-3
 
 
 def clean(parts: dict[str, NDArray[np.float32]], notes: dict[str, Any]) -> Samples:
-    """Return samples of finite values within their ranges.
+    """Return samples of finite values within their ranges, in the order of the vocabulary.
 
     Values that are not finite become the quantity's value for a ray that left the scene, counted in
     `notes["repaired"]["samples"]`; others are clipped, counted per quantity in `notes["clipped"]`.
@@ -44,7 +44,7 @@ def clean(parts: dict[str, NDArray[np.float32]], notes: dict[str, Any]) -> Sampl
             notes.setdefault("clipped", {})[f"samples.{name}"] = outside
     if broken:
         notes.setdefault("repaired", {})["samples"] = broken
-    return Samples.of(parts)
+    return Samples.of({name: parts[name] for name in SAMPLE_BUFFERS if name in parts})
 
 
 def means(samples: Samples, names: Iterable[str]) -> dict[str, Image]:

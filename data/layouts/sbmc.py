@@ -108,9 +108,8 @@ def read(scene: str, folder: Path, names: tuple[str, ...], index: int) -> Frame:
         index: Number of the frame, or of the tile in the sorted folder.
 
     Raises:
-        ModuleNotFoundError: lz4 is not installed.
         OSError: A tile is missing.
-        ValueError: A tile is damaged; names file and field or block.
+        ValueError: A tile is damaged (names file and field or block), or lz4 is not installed.
     """
     if not names:
         tile = read_tile(folder / _names(folder, folder.stat().st_mtime_ns)[index])

@@ -142,9 +142,9 @@ def read_tile(path: Path) -> Tile:
     """Read a tile.
 
     Raises:
-        ModuleNotFoundError: lz4 is not installed; the message says how to install it.
         OSError: The file cannot be opened.
-        ValueError: The header is not plausible, or a block is truncated, damaged or of another size.
+        ValueError: The header is not plausible, a block is truncated, damaged or of another size, or lz4 is
+            not installed; the message then says how to install it.
     """
     with path.open("rb") as file:
         header = _header(path, file)
@@ -214,7 +214,7 @@ def _block(path: Path, file: BinaryIO, what: str, size: int) -> bytes:
     try:
         import lz4.frame
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
+        raise ValueError(
             f"{path} is read with lz4, which is not installed: pip install penumbra-denoise[layouts]"
         ) from error
     prefix = file.read(4)
