@@ -70,10 +70,7 @@ def buffers_of(channels: Iterable[str]) -> dict[str, list[str]]:
 
 def views(root: Path) -> list[MergedView]:
     """Return the frames below a root, by the names of the files alone."""
-    if not root.is_dir():
-        return []
-    folders = [root, *sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))]
-    return [v for folder in folders for v in _folder_views(folder, folder == root, folder.stat().st_mtime_ns)]
+    return [v for f in _folders(root) for v in _folder_views(f, f == root, f.stat().st_mtime_ns)]
 
 
 def share(found: list[MergedView], needed: set[str], without: set[str]) -> float:
@@ -96,6 +93,8 @@ def scenes(layout: str, root: Path, needed: tuple[str, ...], credit: str, proven
         ValueError: A buffer is missing and cannot be derived, or some frames of a scene lack a reference.
         OSError: A file cannot be opened.
     """
+    for folder in _folders(root):
+        _check_references(layout, root, folder)
     grouped: dict[str, list[MergedView]] = {}
     for view in views(root):
         grouped.setdefault(view.scene, []).append(view)
@@ -143,6 +142,32 @@ def read(root: Path, needed: tuple[str, ...], scene: str, index: int) -> Frame:
     return frame
 
 
+def _folders(root: Path) -> list[Path]:
+    if not root.is_dir():
+        return []
+    return [root, *sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))]
+
+
+def _check_references(layout: str, root: Path, folder: Path) -> None:
+    """Refuse a reference that belongs to no frame."""
+    files = _files(folder)
+    marked = _marked(files)
+    noisy = {_view_of(p.stem, marked)[0] for p in files if p not in marked.values()}
+    for name, path in marked.items():
+        if noisy and name not in noisy and (name or len(noisy) > 1):
+            told = f"buffer 'color' (the noisy file that {path.name} is the reference of)"
+            raise missing_buffer(layout, folder, told, [p.name for p in files], root)
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.glob("*.exr") if p.is_file() and not p.name.startswith("."))
+
+
+def _marked(files: Iterable[Path]) -> dict[str, Path]:
+    """Return view → reference for the files whose names mark them; an empty view is the only one."""
+    return {m["view"] or "": p for p in files if (m := _REFERENCE.fullmatch(p.stem))}
+
+
 def _gathered(path: Path, label: str) -> tuple[Gathering, list[str]]:
     image = read_exr(path)
     gathering = Gathering(label)
@@ -176,8 +201,8 @@ def _check(layout: str, root: Path, view: MergedView, needed: tuple[str, ...]) -
 
 @lru_cache(maxsize=256)
 def _folder_views(folder: Path, top: bool, changed: int) -> tuple[MergedView, ...]:
-    files = sorted(p for p in folder.glob("*.exr") if p.is_file() and not p.name.startswith("."))
-    marked = {m["view"] or "": p for p in files if (m := _REFERENCE.fullmatch(p.stem))}
+    files = _files(folder)
+    marked = _marked(files)
     noisy: dict[str, list[tuple[int | None, Path]]] = {}
     for path in files:
         if path in marked.values():
@@ -187,7 +212,7 @@ def _folder_views(folder: Path, top: bool, changed: int) -> tuple[MergedView, ..
     found = []
     for number, (name, unsorted) in enumerate(sorted(noisy.items())):
         levels = sorted(unsorted, key=lambda level: (level[0] or 0, level[1]))
-        reference, most = marked.get(name, marked.get("")), None
+        reference, most = marked.get(name, marked.get("") if len(noisy) == 1 else None), None
         if reference is None and len(levels) > 1 and levels[-1][0] is not None:
             most, reference = levels.pop()
         scene = (name or folder.resolve().name) if top else folder.resolve().name

@@ -122,6 +122,33 @@ def test_a_reference_without_color_is_named(tmp_path):
         kpcn.describe(tmp_path)
 
 
+def frame_groups(seed):
+    made = shot(seed)
+    return {"default": made["color"]} | {
+        g: made[g] for g in ("diffuse", "specular", "albedo", "normal", "depth")
+    }
+
+
+def test_one_reference_without_a_name_is_that_of_the_only_view(tmp_path):
+    write_merged(tmp_path / "a" / "sample.exr", frame_groups(3))
+    write_merged(tmp_path / "a" / "gt.exr", {"default": shot(3)["converged_color"]})
+    frame = kpcn.describe(tmp_path)[0].read(0)
+    assert np.array_equal(frame.buffers["reference"], shot(3)["converged_color"])
+    write_merged(tmp_path / "a" / "another.exr", frame_groups(4))
+    with pytest.raises(ValueError, match=r"missing buffer 'color' \(the noisy file that gt\.exr is the ref"):
+        kpcn.describe(tmp_path)
+
+
+def test_a_reference_without_its_frame_is_named(tmp_path):
+    write_merged(tmp_path / "hall.exr", frame_groups(3))
+    for name in ("hall", "roof"):
+        write_merged(tmp_path / f"{name}_ref.exr", {"default": shot(3)["converged_color"]})
+    with pytest.raises(
+        ValueError, match=r"the noisy file that roof_ref\.exr is the reference of\); found hall"
+    ):
+        kpcn.describe(tmp_path)
+
+
 def test_channels_without_a_meaning_are_listed(tmp_path):
     path = noisy(miniature(tmp_path))
     extra = np.ones((20, 24), np.float32)
