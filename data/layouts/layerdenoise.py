@@ -71,8 +71,8 @@ def describe(root: str | Path) -> list[Scene]:
 
     Raises:
         OSError: The root does not exist.
-        ValueError: h5py is not installed, no input file, a data set that is missing, hostile or of another shape, or a reference
-            that does not fit; names file and data set.
+        ValueError: h5py is not installed, no input file, a data set that is missing, hostile or of another
+            shape, or a reference that does not fit; names file and data set.
     """
     root = Path(root)
     require_folder(root)
