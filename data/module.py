@@ -15,7 +15,8 @@ from data.sample import TRAIN_PATCHES
 from data.shards.batch import Batches, available
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
-from data.shards.options import PrepareOptions
+from data.shards.options import recipe_options
+from data.shards.planes import SAMPLES
 from data.shards.prepare import cached_path, prepare_cached
 from data.shards.progress import LineProgress
 from data.shards.read import CorruptSampleError, Sample, ShardReader
@@ -45,9 +46,11 @@ class Shards(LightningDataModule):
         exposure_stops: Vary the exposure of training patches by up to so many stops up and down.
         permute: Permute colour channels and world axes of training patches.
         drop_history: Share of training patches whose input is not accumulated.
-        train_patches: Training patches per 1280x720 frame, where the root is prepared here; None: 80 as in
-            WSKP, and for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES`.
-        validation_patches: Validation patches per 1280x720 frame, where the root is prepared here.
+        train_patches: Training patches per 1280x720 frame, where the root is prepared here; None: as the
+            recipe says, 80 as in WSKP without one, and for a sample, whose frames are few and small,
+            `data.sample.TRAIN_PATCHES`.
+        validation_patches: Validation patches per 1280x720 frame, where the root is prepared here; None: as
+            the recipe says, 20 without one.
         patch_size: Width and height of patches, where the root is prepared here.
         on_corrupt: What to do about a damaged sample: `raise` an error, or `skip` it, with a warning for
             each.
@@ -57,6 +60,13 @@ class Shards(LightningDataModule):
             network.
         temporal: Deliver `irradiance` accumulated over preceding frames as stored, otherwise color / albedo
             of the frame alone. The command line fills it in from the network.
+        recipe: How the root is prepared here, `bmfr`, `afgsa` or `layers` (see `trainer prepare --help`);
+            None: as WSKP, with whatever samples the frames keep apart.
+        spp: Use only frames with these samples per pixel, where the root is prepared here; None: all.
+
+    Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W) and `sample_channels`,
+    a list of C names such as `radiance.R`. They are not augmented yet, so that needs `augment` off, or
+    `buffers` without `samples`.
     """
 
     def __init__(
@@ -71,12 +81,14 @@ class Shards(LightningDataModule):
         permute: bool = False,
         drop_history: float = 0.0,
         train_patches: int | None = None,
-        validation_patches: int = 20,
+        validation_patches: int | None = None,
         patch_size: int = 128,
         on_corrupt: Literal["raise", "skip"] = "raise",
         verify: bool = True,
         buffers: Sequence[str] | None = None,
         temporal: bool = True,
+        recipe: Literal["bmfr", "afgsa", "layers"] | None = None,
+        spp: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0:
@@ -90,16 +102,21 @@ class Shards(LightningDataModule):
             if augment
             else Augmentation("none", seed=seed)
         )
-        if train_patches is None:
-            train_patches = TRAIN_PATCHES if root.startswith(SAMPLE) else PrepareOptions().train_patches
-        self.options = PrepareOptions(
-            patch_size=patch_size,
-            train_patches=train_patches,
-            validation_patches=validation_patches,
-            seed=seed,
-        )
+        if train_patches is None and recipe is None and root.startswith(SAMPLE):
+            train_patches = TRAIN_PATCHES
+        explicit = {
+            "patch_size": patch_size,
+            "train_patches": train_patches,
+            "validation_patches": validation_patches,
+            "seed": seed,
+            "spp": None if spp is None else tuple(spp),
+        }
+        self.options = recipe_options(recipe, explicit)
         self.on_corrupt, self.verify = on_corrupt, verify
-        self.buffers = None if buffers is None else tuple(buffer(name).name for name in buffers)
+        for name in buffers or ():
+            if name != SAMPLES:
+                buffer(name)
+        self.buffers = None if buffers is None else tuple(buffers)
         self.temporal = temporal
         # Ranks with an odd sample less have an evaluation batch less, and with few frames none.
         self.allow_zero_length_dataloader_with_multiple_devices = True
@@ -219,6 +236,11 @@ class Shards(LightningDataModule):
         held = available(sample)
         wanted = held if self.buffers is None else (*self.buffers, "reference")
         missing = [name for name in wanted if name not in held]
+        if SAMPLES in missing:
+            raise ValueError(
+                f"{self.index.root} has no samples of each pixel, which the network reads; render or ingest "
+                "frames that keep them apart, and prepare those"
+            )
         if missing:
             raise ValueError(
                 f"{self.index.root} has no buffer {', '.join(missing)}; its {reader.split} samples hold "

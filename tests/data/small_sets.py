@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from data.frame import Frame
+from data.buffers import sample_channels
+from data.frame import Frame, Samples
 from data.ingestion import write_record
 from data.manifest import Manifest, SceneRecord
 from data.shards.index import Index
@@ -14,6 +16,10 @@ from data.shards.options import PrepareOptions
 from data.shards.prepare import prepare
 
 SPLITS = {"train": ["hall", "roof"], "validation": [], "test": ["cave"]}
+
+
+CHANNELS = sample_channels("radiance", "normal", "roughness")
+"""Channels of the samples of `with_samples`, all of which half precision holds."""
 
 
 def frame(scene: str, index: int, width: int = 48, height: int = 40, scale: float = 1.0) -> Frame:
@@ -41,6 +47,41 @@ def frame(scene: str, index: int, width: int = 48, height: int = 40, scale: floa
         exposure=0.5 + index,
         spp=1,
     )
+
+
+def with_samples(made: Frame, count: int, depth: bool = False, bright: float = 0.0) -> Frame:
+    """Return the frame with so many samples; `bright` is added to one value of their radiance."""
+    generator = np.random.default_rng([made.index, count])
+    shape = (count, made.height, made.width)
+    parts = {
+        "radiance": generator.exponential(1, (*shape, 3)).astype(np.float32),
+        "normal": generator.uniform(-1, 1, (*shape, 3)).astype(np.float32),
+        "roughness": generator.random((*shape, 1), np.float32),
+    }
+    parts["radiance"][0, 0, 0, 0] += bright
+    if depth:
+        parts["depth"] = generator.uniform(1, 9, (*shape, 1)).astype(np.float32)
+    return replace(made, samples=Samples.of(parts))
+
+
+def write_stills(root: Path, views: int = 4, levels: tuple[int, ...] = (4, 8), samples: bool = False) -> Path:
+    """Write a set of stills: each view once for each number of samples per pixel, one frame after the other.
+
+    Views of the training scenes `hall` and `roof`; with `samples`, they are kept apart.
+    """
+    scenes = {}
+    for scene in ("hall", "roof"):
+        records = []
+        for index in range(views * len(levels)):
+            made = replace(frame(scene, index), spp=levels[index % len(levels)])
+            made.notes["view"] = index // len(levels)
+            if samples:
+                made = with_samples(made, levels[index % len(levels)])
+            records.append(write_record(made, root))
+        scenes[scene] = SceneRecord(tuple(records), sequence=False)
+    splits: dict[str, list[str]] = {"train": ["hall", "roof"], "validation": [], "test": []}
+    Manifest("stills", "penumbra", "euclidean", splits, scenes).save(root)
+    return root
 
 
 def write_set(

@@ -16,7 +16,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from data.module import Shards
 from data.shards.index import Index
-from tests.data.small_sets import write_set, write_shards
+from data.shards.options import PrepareOptions
+from data.shards.prepare import prepare
+from tests.data.small_sets import CHANNELS, OPTIONS, write_set, write_shards, write_stills
 
 INPUTS = ("irradiance", "albedo", "normal", "depth")
 pytestmark = [
@@ -344,3 +346,42 @@ def test_two_ranks_share_the_samples_and_lightning_keeps_the_loader(index: Index
         assert len(keys) == passes * index.count(split)
         assert len(set(keys)) == index.count(split)
     assert len(ranks[0]["test"]) == len(ranks[1]["test"]) + 1
+
+
+def stills(folder: Path) -> Index:
+    return prepare(write_stills(folder / "frames", 2, (4,), samples=True), folder / "shards", OPTIONS)
+
+
+def test_samples_are_delivered_to_a_network_that_reads_them(tmp_path: Path):
+    index = stills(tmp_path)
+    data = Shards(str(index.root), 2, 0, augment=False, buffers=("samples",), temporal=False)
+    batch = next(iter(data.train_dataloader()))
+    assert batch["samples"].shape == (2, 4, len(CHANNELS), 16, 16)
+    assert batch["sample_channels"] == list(CHANNELS)
+    with pytest.raises(ValueError, match="not flipped, rotated or permuted yet"):
+        Shards(str(index.root), 2, 0, buffers=("samples",)).train_dataloader()
+    assert "samples" not in next(iter(Shards(str(index.root), 2, 0, buffers=("color",)).train_dataloader()))
+
+
+def test_samples_through_a_worker_are_those_read_here(tmp_path: Path):
+    index = stills(tmp_path)
+    here, there = (
+        next(iter(Shards(str(index.root), 2, workers, augment=False, buffers=("samples",)).val_dataloader()))
+        for workers in (0, 1)
+    )
+    assert torch.equal(here["samples"], there["samples"])
+    assert here["sample_channels"] == there["sample_channels"]
+
+
+def test_shards_without_samples_are_told_from_a_missing_buffer(index: Index):
+    with pytest.raises(ValueError, match="no samples of each pixel, which the network reads"):
+        Shards(str(index.root), 2, 0, augment=False, buffers=("samples",)).train_dataloader()
+
+
+def test_a_root_is_prepared_here_by_recipe_and_samples_per_pixel(tmp_path: Path):
+    root = write_stills(tmp_path / "frames")
+    options = Shards(str(root), recipe="afgsa", spp=[8], patch_size=16).options
+    assert (options.sampling, options.candidates, options.spp) == ("importance", 400, (8,))
+    assert (options.recipe, options.train_patches, options.accumulate) == ("afgsa", 80, False)
+    assert Shards(str(root)).options == PrepareOptions()
+    assert Shards("sample:bmfr", recipe="layers").options.train_patches == 56

@@ -12,8 +12,9 @@ from data.augment import Augmentation, Turn, turned
 from data.frames import FrameSet
 from data.shards.batch import Batches, Order
 from data.shards.index import INDEX, Index
+from data.shards.prepare import prepare
 from data.shards.read import CorruptSampleError, ShardReader
-from tests.data.small_sets import write_shards
+from tests.data.small_sets import CHANNELS, OPTIONS, write_shards, write_stills
 
 NAMES = ("color", "irradiance", "albedo", "normal", "depth", "history", "reference")
 
@@ -234,3 +235,42 @@ def test_an_index_of_another_kind_is_refused(index: Index, tmp_path: Path, chang
     (tmp_path / INDEX).write_text(json.dumps({**record, **change}))
     with pytest.raises(ValueError, match=r"index\.json is not an index of shards that this version reads"):
         Index.read(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Index:
+    folder = tmp_path_factory.mktemp("sampled")
+    return prepare(write_stills(folder / "frames", 2, (4,), samples=True), folder / "shards", OPTIONS)
+
+
+def test_samples_come_back_as_they_were_rendered_with_the_names_of_their_channels(sampled: Index):
+    frames = FrameSet(sampled.root.parent / "frames")
+    reader = ShardReader(sampled, "train")
+    assert reader.array(0, "samples").dtype == torch.float16
+    batch = Batches(reader, ("samples", "depth"), False)[Order(0, (0, 3, len(reader) - 1))].unpack()
+    assert batch["samples"].shape == (3, 4, len(CHANNELS), 16, 16)
+    assert batch["samples"].dtype == torch.float32
+    assert batch["sample_channels"] == list(CHANNELS)
+    for row, (scene, number) in enumerate(zip(batch["scene"], batch["frame"].tolist(), strict=True)):
+        place = int(batch["depth"][row, 0, 0, 0]) - 1
+        y, x = divmod(place, 48)
+        samples = frames.read(scene, number).samples
+        assert samples is not None
+        expected = samples.values[:, y : y + 16, x : x + 16].transpose(0, 3, 1, 2)
+        assert np.array_equal(batch["samples"][row], expected)
+
+
+def test_batches_without_samples_name_no_channels(sampled: Index):
+    batch = Batches(ShardReader(sampled, "train"), ("color",), False)[Order(0, (0, 1))].unpack()
+    assert "sample_channels" not in batch
+
+
+@pytest.mark.parametrize("augmentation", [Augmentation("wskp"), Augmentation("none", permute=True)])
+def test_samples_are_not_augmented_but_refused(sampled: Index, augmentation: Augmentation):
+    reader = ShardReader(sampled, "train")
+    with pytest.raises(ValueError, match=r"not flipped, rotated or permuted yet.*--data\.augment false"):
+        Batches(reader, ("samples",), False, augmentation=augmentation)
+    Batches(reader, ("color",), False, augmentation=augmentation)
+    exposed = Batches(reader, ("samples",), False, augmentation=Augmentation("none", exposure_stops=2))
+    plain = Batches(reader, ("samples",), False)
+    assert torch.equal(exposed[Order(1, (0,))].pixels, plain[Order(1, (0,))].pixels)
