@@ -47,7 +47,7 @@ EXPOSURE = {"outdoor": 0.6, "indoor": 1.3}
 MATERIALS = 24
 GLASSES = 3
 MAX_TRIANGLES = 500_000
-_TRIES = 4
+_MOST_BROKEN = 50
 
 
 @dataclass
@@ -58,7 +58,7 @@ class _Source:
     kind: str
     assets: Assets
     used: dict[Path, str] = field(default_factory=dict)
-    skipped: list[str] = field(default_factory=list)
+    skipped: dict[Path, str] = field(default_factory=dict)
     _read: dict[Path, Any] = field(default_factory=dict)
 
     def stream(self, part: str, number: int = 0) -> Rng:
@@ -70,23 +70,24 @@ class _Source:
         """Return one of the user's files with the probability they ask for; unreadable ones are noted.
 
         Raises:
-            ValueError: Several files in a row cannot be read.
+            ValueError: None of the files can be read, or `_MOST_BROKEN` of them cannot.
         """
         if not files or rng.random() >= self.assets.share:
             return None
-        said = ""
-        for _ in range(_TRIES):
-            path = files[int(rng.integers(len(files)))]
+        while True:
+            good = [p for p in files if p not in self.skipped]
+            path = good[int(rng.integers(len(good)))]
             try:
                 if path not in self._read:
                     self._read[path] = reader(path)
+                self.used.setdefault(path, file_hash(path))
+                return self._read[path]
             except (ValueError, OSError) as error:
-                said = str(error)
-                self.skipped.append(said)
-                continue
-            self.used.setdefault(path, file_hash(path))
-            return self._read[path]
-        raise ValueError(f"{_TRIES} of your own files in a row could not be used; the last: {said}")
+                self.skipped[path] = str(error)
+                if len(good) == 1 or len(self.skipped) >= _MOST_BROKEN:
+                    raise ValueError(
+                        f"too many of your own files cannot be used; the last: {error}"
+                    ) from error
 
     def texture(self, part: str, number: int, vividness: float = 1.0) -> Callable[[], Picture]:
         """Return what draws colour textures for a part of the scene."""

@@ -214,7 +214,7 @@ def _reveal(start: Floats, way: Floats, out: Floats, hole: Hole) -> Mesh:
     corners = [(hole.start, hole.low), (hole.end, hole.low), (hole.end, hole.high), (hole.start, hole.high)]
     ring = np.array([[*(start + s * way), y] for s, y in [*corners, corners[0]]])[:, [0, 2, 1]]
     outer = ring + np.array([out[0], 0, out[1]])
-    return box_uvs(flat(np.concatenate([ring, outer]), grid_faces(2, 5)))
+    return box_uvs(flat(np.concatenate([outer, ring]), grid_faces(2, 5)))
 
 
 def cuboid(box: Box) -> Mesh:

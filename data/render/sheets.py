@@ -27,20 +27,18 @@ def plate(rng: Rng) -> Mesh:
         for o, y in ((square, -half), (square, half), (hole, half), (hole, -half), (square, -half))
     ]
     strips = [flat(np.concatenate(lines[k : k + 2]), grid_faces(2, 25)) for k in range(1, 4)]
-    side = flat(np.concatenate(lines[:2]), grid_faces(2, 25))
-    middle = [
-        np.array([i - (columns - 1) / 2, 0, j - (rows - 1) / 2]) for i in range(columns) for j in range(rows)
-    ]
     tile = joined([box_uvs(s) for s in strips])
-    tiles = [transformed(tile, affine(np.eye(3), m)) for m in middle]
-    rim = box_uvs(_frame(side, columns, rows))
-    return joined([*tiles, rim])
-
-
-def _frame(side: Mesh, columns: int, rows: int) -> Mesh:
-    """Return the side walls of a unit square stretched to columns x rows."""
-    vertices = side.vertices.astype(np.float64) * [columns, 1, rows]
-    return flat(vertices, side.faces.astype(np.int64))
+    tiles = []
+    for i in range(columns):
+        for j in range(rows):
+            at = affine(np.eye(3), [i - (columns - 1) / 2, 0.0, j - (rows - 1) / 2])
+            tiles.append(transformed(tile, at))
+            # The four sides of the outline in its order: far, left, near, right.
+            outer = (j == rows - 1, i == 0, j == 0, i == columns - 1)
+            for side in np.flatnonzero(outer):
+                part = [line[6 * side : 6 * side + 7] for line in lines[:2]]
+                tiles.append(transformed(box_uvs(flat(np.concatenate(part), grid_faces(2, 7))), at))
+    return joined(tiles)
 
 
 def blades(rng: Rng) -> Mesh:

@@ -1,7 +1,7 @@
 """Procedural environments as latitude-longitude pictures (256, 512): skies, studios, interiors, gradients.
 
-Row 0 is straight up (+Y). Column 0 looks along -Z, a quarter of the width further along +X, as Mitsuba's
-`envmap` has it. The clear sky is a gradient of our own with the ingredients of A. Preetham, P. Shirley,
+As Mitsuba's `envmap` has it, the first row is straight up (+Y) and the last straight down, and columns are
+half a pixel from the picture's edge: the first looks along -Z, a quarter of the width further is +X. The clear sky is a gradient of our own with the ingredients of A. Preetham, P. Shirley,
 B. Smits, A practical analytic model for daylight, SIGGRAPH 1999, DOI 10.1145/311535.311545: darker and bluer
 away from the horizon, a bright halo around the sun, everything redder as the sun sinks.
 """
@@ -27,15 +27,15 @@ GREY = 0.4
 
 
 def directions(height: int = HEIGHT, width: int = WIDTH) -> Floats:
-    """Return the unit direction of every pixel's middle (height, width, 3)."""
-    theta = (np.arange(height) + 0.5)[:, None] / height * np.pi
+    """Return the unit direction of every pixel (height, width, 3)."""
+    theta = np.arange(height)[:, None] / (height - 1) * np.pi
     phi = (np.arange(width) + 0.5)[None, :] / width * 2 * np.pi
     return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi, -np.sin(theta) * np.cos(phi)], -1)
 
 
 def solid_angles(height: int = HEIGHT, width: int = WIDTH) -> Floats:
     """Return the solid angle of every pixel (height, 1) in steradians."""
-    edges = np.cos(np.arange(height + 1) / height * np.pi)
+    edges = np.cos(np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0, 1) * np.pi)
     return (-np.diff(edges) * 2 * np.pi / width)[:, None]
 
 

@@ -25,7 +25,7 @@ def score(seen: Seen, rng: Rng) -> float:
     cover = float(things.mean())
     counts = np.bincount(seen.thing[things], minlength=1) / len(things)
     near = float(np.quantile(seen.distance, 0.05))
-    value = min(cover, 0.65) + 0.02 * min(int((counts > 0).sum()), 15)
+    value = min(cover, 0.5) + 0.03 * min(int((counts > 0).sum()), 16)
     value -= 1.0 * max(counts.max() - 0.3, 0) + 0.5 * max(0.8 - near, 0) + max(cover - 0.9, 0)
     value -= 0.6 * max(float(np.isinf(seen.distance).mean()) - 0.35, 0)
     return value + float(rng.uniform(0, 0.12))
