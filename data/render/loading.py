@@ -43,17 +43,19 @@ class LoadedScene:
             return
         for name, displacement in self.moving.items():
             positions = self._rest[name][0] + np.float32(shutters) * np.asarray(displacement, np.float32)
-            key = f"{name}.vertex_positions"
-            self._parameters[key] = type(self._parameters[key])(positions.ravel())
+            self._set(f"{name}.vertex_positions", positions.ravel())
         self._parameters.update()
         # Mitsuba makes its own vertex normals whenever positions change; a displacement keeps the given ones.
         kept = {name: normals for name, (_, normals) in self._rest.items() if normals is not None}
         for name, normals in kept.items():
-            key = f"{name}.vertex_normals"
-            self._parameters[key] = type(self._parameters[key])(normals)
+            self._set(f"{name}.vertex_normals", normals)
         if kept:
             self._parameters.update()
         self._at = shutters
+
+    def _set(self, key: str, values: NDArray[np.float32]) -> None:
+        # A copy: Dr.Jit shares memory with NumPy, and Mitsuba writes its own normals into it.
+        self._parameters[key] = type(self._parameters[key])(values.copy())
 
 
 def load(spec: SceneSpec) -> LoadedScene:

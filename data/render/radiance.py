@@ -44,7 +44,9 @@ class Radiance:
         self._scene = scene
         self._materials = materials
         self._scalar = is_scalar()
-        self.path = mitsuba.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": ROULETTE})
+        # Images of the scalar variant are made in blocks with a seed each: the same whatever the threads.
+        path = {"type": "path", "max_depth": max_depth, "rr_depth": ROULETTE, "block_size": 16}
+        self.path = mitsuba.load_dict(path)
         self._rest = mitsuba.load_dict({"type": "path", "max_depth": max_depth - 1, "rr_depth": ROULETTE - 1})
 
     def whole(self, sampler: Any, ray: Any) -> Any:

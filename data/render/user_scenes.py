@@ -236,7 +236,7 @@ def _around(judge: _Judge, original: View, jitter: Jitter, rng: np.random.Genera
 
 
 def _orbit(judge: _Judge, original: View, degrees: float, frames: int) -> tuple[View, ...]:
-    for attempt in range(_TRIES // 4):
+    for attempt in range(_TRIES // 2):
         angle = degrees * 0.75 ** (attempt // 2) * (-1) ** attempt
         views = orbit(original, judge.pivot, angle, frames)
         steps = pairwise(views)

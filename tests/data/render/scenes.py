@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
 
+from data.render import variant as variants
 from data.render.camera_paths import look_at
 from data.render.spec import Mesh, Picture, SceneSpec, View
+from data.render.tracer import Tracer
+from data.render.variant import Variant, choose
 
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.6, 0.6, 0.6]}}
 GOLD = {"type": "roughconductor", "material": "Au", "alpha": 0.15}
@@ -54,8 +58,8 @@ def objects(*bsdfs: dict[str, Any], width: int = 24) -> SceneSpec:
     """Cubes of the given materials side by side before nothing, under a constant sky."""
     content: dict[str, Any] = {"sky": {"type": "constant"}}
     for i, bsdf in enumerate(bsdfs):
-        x = (i - (len(bsdfs) - 1) / 2) * 0.9
-        content[f"cube{i}"] = {"type": "mesh", "mesh": cube((x, 0, 0), 0.7), "bsdf": bsdf}
+        x = (i - (len(bsdfs) - 1) / 2) * 2.4 / len(bsdfs)
+        content[f"cube{i}"] = {"type": "mesh", "mesh": cube((x, 0, 0), 1.6 / len(bsdfs)), "bsdf": bsdf}
     return SceneSpec("objects", content, (view(width, 8),))
 
 
@@ -114,3 +118,24 @@ def moving(displacement: tuple[float, float, float] = (0.6, 0.0, 0.0), frames: i
         "cube": {"type": "mesh", "mesh": cube((0, 0, 0), 0.8), "bsdf": GREY, "emitter": lamp(2.0)},
     }
     return SceneSpec("moving", content, (view(),) * frames, {"cube": displacement}, path=frames > 1)
+
+
+@functools.cache
+def activate() -> Variant:
+    """Make the fastest variant of this machine that of the test process."""
+    variant = choose()
+    variants.activate(variant, threads=2)
+    return variant
+
+
+def few(samples: int) -> int:
+    """As many samples as the variant makes in acceptable time."""
+    return samples if activate().name == "llvm_ad_rgb" else max(4, samples // 64)
+
+
+def trace(spec: SceneSpec, *names: str, spp: int = 16, **options: Any) -> dict[str, np.ndarray]:
+    """All samples of a small image: name → (S, H, W, C)."""
+    activate()
+    frame, seed = options.pop("frame", 0), options.pop("seed", 1)
+    chunks = list(Tracer(spec).trace(frame, spp, seed, names, **options))
+    return {name: np.concatenate([c.values[name] for c in chunks]) for name in names}
