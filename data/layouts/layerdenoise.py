@@ -76,7 +76,7 @@ def describe(root: str | Path) -> list[Scene]:
     """
     root = Path(root)
     require_folder(root)
-    inputs = sorted(p for p in root.rglob("*") if p.is_file() and _INPUT.fullmatch(p.name))
+    inputs = sorted(p for p in root.rglob("*") if _INPUT.fullmatch(p.name) and _is_visible(root, p))
     if not inputs:
         raise ValueError(
             f"{root}: no file of the layout `layerdenoise` found, expected <name>_input.h5 (or <name>_in.h5) "
@@ -116,6 +116,10 @@ def read(scene: str, path: Path, reference: Path | None, index: int) -> Frame:
     frame.samples = kept
     frame.validate()
     return frame
+
+
+def _is_visible(root: Path, path: Path) -> bool:
+    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)
 
 
 def _scene(root: Path, path: Path) -> Scene:

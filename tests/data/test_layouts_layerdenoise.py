@@ -72,6 +72,12 @@ def test_a_set_without_reference_is_read_without_it(tmp_path):
     assert "reference" not in next(layerdenoise.frames(tmp_path)).buffers
 
 
+def test_hidden_files_are_no_scenes(tmp_path):
+    layer_pair(tmp_path, "clip")
+    (tmp_path / "._clip_input.h5").write_bytes(b"resource fork")
+    assert [s.name for s in layerdenoise.describe(tmp_path)] == ["clip"]
+
+
 def test_files_in_folders_are_scenes_with_their_path(tmp_path):
     for folder in ("train", "test"):
         layer_pair(tmp_path / folder, "clip")
