@@ -20,8 +20,7 @@ from data.shards.cut import PrepareOptions
 from data.statistics import Histogram
 from trainer.reports.findings import ENERGY_Z, FIREFLIES, Finding
 from trainer.reports.frame_facts import FrameFacts
-from trainer.reports.pictures import colors
-from trainer.reports.svg import fixed, histogram_svg, number, outside_text, percent, split_svg
+from trainer.reports.svg import fixed, heat_css, histogram_svg, number, outside_text, percent, split_svg
 
 STRIP = 12
 """Frames of a scene that are shown in a row."""
@@ -116,17 +115,17 @@ def render(
     }
     manifest = frames.manifest
     scenes = [_scene_view(manifest, name, [f for f in facts if f.scene == name]) for name in manifest.scenes]
+    splits = split_rows(manifest)
     return environment.get_template("data_report.html.j2").render(
         manifest=manifest,
-        root=frames.root,
         scenes=scenes,
         anchors={s.name: s.anchor for s in scenes},
         findings=found,
         noise=noise_rows(scenes),
         own=any("reference_relmse" in f.record.checks for f in facts),
         heat=heat_css(),
-        splits=split_rows(manifest),
-        split_bar=split_svg({s: _frame_count(manifest, s) for s in SPLITS if manifest.splits.get(s)}),
+        splits=splits,
+        split_bar=split_svg({r["split"]: r["frames"] for r in splits if r["frames"]}),
         pairs=pair_rows(manifest, facts, pairs),
         size=_size_text(manifest),
         bytes=sum(f.bytes for s in manifest.scenes.values() for f in s.frames),
@@ -269,12 +268,6 @@ def _urgency(row: Mapping[str, Any]) -> tuple[bool, bool, float]:
     return not row["leak"], not row["same_view"], -row["light"]
 
 
-def heat_css() -> str:
-    """Return the colours of the density maps as a CSS gradient."""
-    chosen = colors()[np.linspace(40, 255, 12).astype(int)]
-    return "linear-gradient(90deg, " + ", ".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in chosen) + ")"
-
-
 def _percent(share: float | None) -> str:
     return "–" if share is None else percent(share)
 
@@ -289,10 +282,6 @@ def _json(values: Mapping[str, Any]) -> str:
 
 def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
-
-
-def _frame_count(manifest: Manifest, split: str) -> int:
-    return sum(len(manifest.scenes[n].frames) for n in manifest.splits.get(split, []))
 
 
 def _size_text(manifest: Manifest) -> str:

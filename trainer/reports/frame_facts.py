@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data.buffers import BUFFERS, buffer
+from data.buffers import buffer
 from data.derive import derive
 from data.duplicates import Fingerprint, fingerprint
 from data.exr import RadianceWarning, looks_encoded
@@ -37,6 +36,7 @@ from trainer.reports.thumbnails import (
     buffer_thumbnail,
     density_picture,
     expected_coverage,
+    in_order,
     picture_of,
     thumbnail,
     window,
@@ -255,13 +255,6 @@ def _draw(facts: FrameFacts, frame: Frame, job: FrameJob) -> None:
             facts.thumbnails[name] = buffer_thumbnail(name, b[name], exposure, job.limit)
     if color is not None:
         facts.patch, facts.density = densities(frame, color, job.limit)
-
-
-def in_order(names: Iterable[str]) -> list[str]:
-    """Return names of buffers in the order of the vocabulary, after `color` and `reference`."""
-    places = {name: i for i, name in enumerate(("color", "reference", *BUFFERS))}
-    places |= {"color": 0, "reference": 1}
-    return sorted(names, key=places.__getitem__)
 
 
 def densities(frame: Frame, color: Array, limit: int) -> tuple[int, dict[str, Thumbnail]]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 from markupsafe import Markup
 
 from data.statistics import Histogram, Scale
+from trainer.reports.pictures import colors
 
 _WIDTH, _HEIGHT = 360, 150
 _LEFT, _RIGHT, _TOP, _BOTTOM = 8, 8, 8, 24
@@ -90,6 +92,12 @@ def split_svg(counts: Mapping[str, int]) -> Markup:
         )
         x += width
     return Markup("").join([*parts, Markup("</svg>")])
+
+
+def heat_css() -> str:
+    """Return the colours of the density maps as a CSS gradient."""
+    chosen = colors()[np.linspace(40, 255, 12).astype(int)]
+    return "linear-gradient(90deg, " + ", ".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in chosen) + ")"
 
 
 def _range(shown: Mapping[str, Histogram]) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from data.buffers import buffer
+from data.buffers import BUFFERS, buffer
 from trainer.reports.pictures import colors, false_color, tone_map
 
 Array = NDArray[np.float32]
@@ -89,6 +89,13 @@ def buffer_thumbnail(name: str, image: Array, exposure: float, limit: int) -> Th
     """
     picture, note = picture_of(name, image, exposure)
     return thumbnail(picture, limit, note, flat=buffer(name).kind != "radiance")
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of buffers in the order of the vocabulary, after `color` and `reference`."""
+    places = {name: i for i, name in enumerate(("color", "reference", *BUFFERS))}
+    places |= {"color": 0, "reference": 1}
+    return sorted(names, key=places.__getitem__)
 
 
 def picture_of(name: str, image: Array, exposure: float) -> tuple[Image.Image, str]:
