@@ -8,7 +8,7 @@ folder, with `<scene>.exr` as the reference where it is there. The albedo is cal
 
 The authors' loader replaces a missing file by zeros without a word; here it is an error, unless the buffer
 follows from others (color = diffuse + specular). It also cuts 128 pixels at (1, 1) from each crop; here crops
-stay whole. The albedo of the reference is not read, nor its diffuse and specular part where it has a color.
+stay whole. The albedo of the reference is not read, nor its specular part, which is color less diffuse.
 
 Source: Xu et al. 2019, doi:10.1145/3355089.3356547.
 """
@@ -23,7 +23,7 @@ from pathlib import Path
 from data.frame import Frame
 from data.layouts.channels import missing_buffer
 from data.layouts.scene import Scene, all_frames, require_folder
-from data.layouts.siblings import View, read_siblings, require_files
+from data.layouts.siblings import View, read_siblings, reference_parts, require_files
 
 ROLES = {
     "color": "color",
@@ -37,7 +37,6 @@ ROLES = {
     "variance": "color_variance",
 }
 NEEDED = ("color", "diffuse", "specular", "normal", "depth", "diffuse_albedo")
-REFERENCE = ("color", "diffuse", "specular")
 
 _WORDS = "|".join(ROLES)
 _CROP = re.compile(rf"(?P<name>.+)-(?P<spp>\d+)spp_(?P<role>{_WORDS})\.exr")
@@ -174,9 +173,7 @@ def _view(
 ) -> View:
     noisy = {ROLES[role]: roles[role] for role in ROLES if role in roles and role != "albedo"}
     noisy |= {} if "texture" in roles or "albedo" not in roles else {"diffuse_albedo": roles["albedo"]}
-    reference = {"color": converged["color"]} if "color" in converged else {}
-    if not reference:
-        reference = {role: converged[role] for role in REFERENCE if role in converged}
+    reference = {role: converged[role] for role in reference_parts(converged)}
     ignored = [p.name for p in converged.values() if p not in reference.values()]
     return View(name, number, noisy, reference, *spp, tuple(sorted(ignored)))
 

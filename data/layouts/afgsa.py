@@ -23,7 +23,7 @@ from data.layouts import afgsa_patches as patches
 from data.layouts import merged
 from data.layouts.channels import missing_buffer
 from data.layouts.scene import Scene, all_frames, require_folder
-from data.layouts.siblings import View, read_siblings, require_files
+from data.layouts.siblings import View, read_siblings, reference_parts, require_files
 
 ROLES = {
     "color": "color",
@@ -34,7 +34,6 @@ ROLES = {
     "albedo": "diffuse_albedo",
 }
 NEEDED = ("color", "normal", "depth", "diffuse_albedo")
-REFERENCE = ("color", "diffuse", "specular")
 CREDIT = "Xu et al. and Yu et al., ACFM and AFGSA data sets"
 
 _FOLDER = re.compile(r"(\d+)spp")
@@ -171,9 +170,7 @@ def _listed(root: Path, changed: tuple[int, ...]) -> dict[str, tuple[View, ...]]
 
 def _view(name: str, number: int, found: dict[int, dict[str, Path]], last: int | None) -> list[View]:
     converged = found.get(last, {}) if last is not None else {}
-    reference = {"color": converged["color"]} if "color" in converged else {}
-    if not reference:
-        reference = {role: converged[role] for role in REFERENCE if role in converged}
+    reference = {role: converged[role] for role in reference_parts(converged)}
     ignored = tuple(sorted(p.name for p in converged.values() if p not in reference.values()))
     levels: list[int | None] = [spp for spp in sorted(found) if spp != last]
     views = []

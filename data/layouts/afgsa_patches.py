@@ -2,8 +2,8 @@
 
 Data sets `noisy`, `gt`, `spec`, `diff`, `spec_gt`, `diff_gt` (N, 128, 128, 3) and `aux` (N, 128, 128, 7): the
 normal as rendered, the depth divided by the largest of its picture, the albedo. Only `noisy`, `gt` and `aux`
-have to be there. Where a patch comes from is not recorded, so that patches of one picture cannot be kept
-together: use the files as they are split.
+have to be there; `spec_gt` is `gt` less `diff_gt` and not read. Where a patch comes from is not recorded, so
+that patches of one picture cannot be kept together: use the files as they are split.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.hdf5 import dataset, items, names, open_hdf5
 from data.layouts.scene import Scene
 
-COLORS = {"noisy": "color", "gt": "reference", "spec": "specular", "diff": "diffuse"}
+COLORS = {
+    "noisy": "color",
+    "gt": "reference",
+    "spec": "specular",
+    "diff": "diffuse",
+    "diff_gt": "reference_diffuse",
+}
 AUX = {"normal": slice(0, 3), "depth": slice(3, 4), "diffuse_albedo": slice(4, 7)}
 SPP, REFERENCE_SPP = 32, 32768
 
@@ -81,7 +87,7 @@ def _scene(root: Path, path: Path) -> Scene:
                 buffers = COLORS.get(key, "normal, depth and albedo")
                 raise missing_buffer("afgsa", path, f"data set {key!r} ({buffers})", present, root)
         shape = dataset(file, "noisy", 4, 3).shape
-        for key in ("gt", "aux", "spec", "diff"):
+        for key in (*COLORS, "aux"):
             if key in present:
                 found = dataset(file, key, 4, 7 if key == "aux" else 3)
                 if found.shape[:3] != shape[:3]:

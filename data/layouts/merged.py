@@ -22,7 +22,7 @@ from data.exr_image import exr_channels, read_exr
 from data.frame import Frame
 from data.layouts.channels import DEFAULT, REFERENCE_WORDS, Gathering, channel_groups, missing_buffer
 from data.layouts.scene import Scene
-from data.layouts.siblings import absent, with_reference
+from data.layouts.siblings import absent, reference_parts, with_reference
 
 GROUPS = {
     "color": "color",
@@ -182,7 +182,7 @@ def _converged(path: Path, label: str) -> Gathering:
     image = read_exr(path)
     found = buffers_of(image.channels)
     gathering = Gathering(label)
-    for name in ("color",) if "color" in found else ("diffuse", "specular"):
+    for name in reference_parts(found):
         gathering.add(name, image, found[name])
     return gathering
 

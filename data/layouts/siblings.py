@@ -105,25 +105,37 @@ def gathered(files: Mapping[str, Path], label: str) -> Gathering:
 
 
 def with_reference(frame: Frame, reference: Gathering) -> Frame:
-    """Return the frame with `color` of another gathering, derived where necessary, as its reference.
+    """Return the frame with `color` and `diffuse` of another gathering as its reference, derived if need be.
 
     Raises:
         ValueError: The reference has another size.
     """
-    converged = derive(reference.frame(frame.scene, frame.index, None), ["color"])
+    roles = {"color": "reference"}
+    if {"diffuse", "specular"} & reference.buffers.keys():
+        roles["diffuse"] = "reference_diffuse"
+    converged = derive(reference.frame(frame.scene, frame.index, None), roles)
     if (converged.height, converged.width) != (frame.height, frame.width):
         raise ValueError(
             f"{frame.label}: the reference is {converged.width}x{converged.height}, the noisy buffers are "
             f"{frame.width}x{frame.height}; both must be of one size"
         )
-    result = frame.with_buffers(reference=converged.buffers["color"])
+    result = frame.with_buffers(**{role: converged.buffers[name] for name, role in roles.items()})
     for key in ("repaired", "precision", "channels", "clipped", "derived"):
         told: dict[str, Any] = converged.notes.get(key, {})
-        if "color" in told:
-            result.notes[key] = {**result.notes.get(key, {}), "reference": told["color"]}
-        elif key == "repaired" and told:
-            result.notes[key] = {**result.notes.get(key, {}), "reference": sum(told.values())}
+        renamed = {role: told[name] for name, role in roles.items() if name in told}
+        if key == "repaired" and told and not renamed:
+            renamed = {"reference": sum(told.values())}
+        if renamed:
+            result.notes[key] = {**result.notes.get(key, {}), **renamed}
     return result
+
+
+def reference_parts(found: Mapping[str, Any]) -> list[str]:
+    """Return which of color, diffuse and specular to read as the reference: no more than is needed."""
+    needed = (
+        ("color", "diffuse") if {"color", "diffuse"} <= found.keys() else ("color", "diffuse", "specular")
+    )
+    return [name for name in needed if name in found]
 
 
 def only_group(image: ExrImage) -> list[str]:

@@ -6,6 +6,7 @@ import pytest
 from data.frames import FrameSet
 from data.layouts import LAYOUTS, layout, likeliest, likenesses
 from data.manifest import load_manifest
+from tests.data import layout_samples
 from tests.data.layout_miniatures import MINIATURES, acfm, kpcn, nbgd, shot, tungsten, write_one
 from tests.data.miniature import bmfr_scene, penumbra_scene
 from trainer.cli import main
@@ -15,6 +16,7 @@ KNOWN = {
     "nbgd 64 spp": lambda root: nbgd(root, "64spp"),
     "nbgd positions": lambda root: nbgd(root, "positions"),
     "kpcn with halves": lambda root: kpcn(root, "RGB", halves=True),
+    **{n: getattr(layout_samples, n) for n in ("oidn", "sbmc", "layerdenoise", "blender", "mitsuba")},
     "bmfr": lambda root: bmfr_scene(root, "classroom"),
     "penumbra": lambda root: penumbra_scene(root, "classroom"),
     "penumbra stills": lambda root: penumbra_scene(root, "classroom", kind="stills"),

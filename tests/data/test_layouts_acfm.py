@@ -27,6 +27,7 @@ def test_every_buffer_of_a_crop_is_read_and_the_texture_is_the_raw_albedo(tmp_pa
     for name, stored in (("diffuse", "diffuse"), ("diffuse_albedo", "albedo"), ("depth", "depth")):
         assert np.array_equal(frame.buffers[name], made[stored]), name
     assert np.array_equal(frame.buffers["reference"], made["converged_color"])
+    assert np.array_equal(frame.buffers["reference_diffuse"], made["converged_diffuse"])
     assert (frame.spp, frame.notes["reference_spp"], frame.notes["view"]) == (32, 32768, 0)
     assert "albedo" not in frame.buffers
     assert (derive(frame, ["albedo"]).buffers["albedo"][0, 0] == 1).all()
@@ -34,7 +35,7 @@ def test_every_buffer_of_a_crop_is_read_and_the_texture_is_the_raw_albedo(tmp_pa
 
 def test_what_is_left_of_the_reference_is_listed(tmp_path):
     ignored = next(acfm.frames(miniature(tmp_path))).notes["ignored"]
-    assert [name.rpartition("_")[2] for name in ignored] == ["diffuse.exr", "specular.exr", "texture.exr"]
+    assert [name.rpartition("_")[2] for name in ignored] == ["specular.exr", "texture.exr"]
 
 
 def test_broken_normals_and_negative_radiance_are_mended_and_counted(tmp_path):
@@ -81,6 +82,11 @@ def test_a_reference_without_color_is_the_sum_of_its_parts(tmp_path):
     assert np.allclose(frame.buffers["reference"], shot(0)["converged_color"], rtol=1e-6)
     assert frame.notes["derived"]["reference"] == "diffuse + specular"
     first_crop(root, "diffuse", "32768").unlink()
+    write_one(first_crop(root, "color", "32768"), shot(0)["converged_color"])
+    frame = next(acfm.frames(root))
+    assert np.allclose(frame.buffers["reference_diffuse"], shot(0)["converged_diffuse"], atol=1e-6)
+    assert frame.notes["derived"]["reference_diffuse"] == "color - specular, at least 0"
+    first_crop(root, "color", "32768").unlink()
     with pytest.raises(ValueError, match=r"missing buffer 'reference' \(color\.exr .* at 32768 spp"):
         acfm.describe(root)
 
@@ -137,7 +143,8 @@ def test_files_of_another_size_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"_depth\.exr: 'depth' is 6x5, but 'color' of bathroom2/frame 0"):
         next(acfm.frames(root))
     miniature(tmp_path, ("bathroom2",), 1)
-    write_one(first_crop(root, "color", "32768"), np.ones((5, 6, 3), np.float32))
+    for role in ("color", "diffuse"):
+        write_one(first_crop(root, role, "32768"), np.ones((5, 6, 3), np.float32))
     with pytest.raises(ValueError, match=r"reference is 6x5, the noisy buffers are 24x20"):
         next(acfm.frames(root))
 

@@ -71,7 +71,12 @@ def test_built_patches_keep_the_names_of_their_files_as_scenes(tmp_path):
 def test_a_patch_has_its_raw_normal_and_its_depth_is_said_to_be_normalised(tmp_path):
     frame = afgsa.describe(afgsa_h5(tmp_path, 3, ("train",), 128))[0].read(2)
     arrays = patch_arrays(3, 128)
-    for name, key in (("color", "noisy"), ("reference", "gt"), ("diffuse", "diff")):
+    for name, key in (
+        ("color", "noisy"),
+        ("reference", "gt"),
+        ("diffuse", "diff"),
+        ("reference_diffuse", "diff_gt"),
+    ):
         assert np.array_equal(frame.buffers[name], np.maximum(arrays[key][2], 0)), name
     aux = arrays["aux"][2]
     assert np.array_equal(frame.buffers["normal"], np.nan_to_num(aux[..., :3]))
@@ -102,7 +107,7 @@ def test_patches_are_read_a_block_at_a_time_and_never_the_whole_data_set(tmp_pat
     for index in (2, 3):
         assert np.array_equal(scene.read(index).buffers["reference"], patch_arrays(6)["gt"][index])
     assert set(asked) == {(2, 4)}
-    assert len(asked) == 5
+    assert len(asked) == 6
 
 
 def test_scenes_can_be_sent_to_other_processes(tmp_path):

@@ -40,6 +40,7 @@ def test_every_group_is_read_from_its_channels_and_normals_are_rgb(tmp_path):
         assert np.array_equal(frame.buffers[name], made[stored]), name
     assert np.array_equal(frame.buffers["normal"], np.nan_to_num(made["normal"]))
     assert np.array_equal(frame.buffers["reference"], made["converged_color"])
+    assert np.array_equal(frame.buffers["reference_diffuse"], made["converged_diffuse"])
 
 
 def test_a_variance_in_one_channel_counts_for_every_channel_and_it_is_said(tmp_path):
