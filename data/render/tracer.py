@@ -10,7 +10,6 @@ random one, and the samples of a slice are traced with the objects displaced to 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.camera import Camera
-from data.render.guides import GUIDES, Guides, Motion, Samples, vector, view_world_to_pixel
+from data.render.guides import GUIDES, Guides, Motion, Samples
 from data.render.loading import LoadedScene, load, sensor
+from data.render.projection import vector, view_world_to_pixel
 from data.render.radiance import Radiance
 from data.render.reflectance import Reflectances
+from data.render.seeds import Seeds, seeds_of
 from data.render.spec import SceneSpec, View
 from data.render.variant import is_scalar
 
@@ -143,9 +144,9 @@ class Tracer:
         if spp < 1:
             raise ValueError(f"spp is {spp}, expected at least 1")
         setting = self._setting(frame, tuple(names), motion, static)
-        return self._chunks(setting, frame, spp, _seeds(seed, frame))
+        return self._chunks(setting, frame, spp, seeds_of(seed, frame))
 
-    def _chunks(self, setting: _Frame, frame: int, spp: int, seeds: _Seeds) -> Iterator[Chunk]:
+    def _chunks(self, setting: _Frame, frame: int, spp: int, seeds: Seeds) -> Iterator[Chunk]:
         width, height = setting.view.width, setting.view.height
         if (
             self._scalar
@@ -164,7 +165,7 @@ class Tracer:
                 values = self._band(setting, frame, band, count, seeds)
                 yield Chunk(band, self._without_invalid(values))
 
-    def _passes(self, setting: _Frame, frame: int, spp: int, seeds: _Seeds) -> Iterator[Chunk]:
+    def _passes(self, setting: _Frame, frame: int, spp: int, seeds: Seeds) -> Iterator[Chunk]:
         """Yield radiance alone in the scalar variant: Mitsuba's own loop is many times faster than ours.
 
         An image of one sample per pixel and a box filter is a sample of every pixel.
@@ -192,7 +193,7 @@ class Tracer:
             yield Chunk(slice(0, view.height), self._without_invalid({"radiance": np.stack(images)}))
 
     def _band(
-        self, setting: _Frame, frame: int, band: slice, count: int, seeds: _Seeds
+        self, setting: _Frame, frame: int, band: slice, count: int, seeds: Seeds
     ) -> dict[str, NDArray[np.float32]]:
         """Return `count` samples of every pixel of some rows."""
         shape = (count, band.stop - band.start, setting.view.width)
@@ -204,7 +205,7 @@ class Tracer:
         return {name: values.reshape(*shape, -1) for name, values in flat.items()}
 
     def _slices(
-        self, setting: _Frame, frame: int, top: int, shape: tuple[int, int, int], seeds: _Seeds
+        self, setting: _Frame, frame: int, top: int, shape: tuple[int, int, int], seeds: Seeds
     ) -> dict[str, NDArray[np.float32]]:
         """Trace every sample with the objects where they are in the sample's slice of the shutter."""
         total = int(np.prod(shape))
@@ -332,27 +333,6 @@ class Tracer:
         for part in light:
             part[bad] = 0
         return values
-
-
-@dataclass
-class _Seeds:
-    """A sequence of seeds, one per wavefront: neighbours differ, so no two wavefronts of a call share one."""
-
-    key: bytes
-    count: int = 0
-
-    def next(self) -> int:
-        """Return the next 32-bit seed."""
-        self.count += 1
-        return (int.from_bytes(self.key[:4], "little") + self.count) % 2**32
-
-    def generator(self) -> np.random.Generator:
-        """Return a generator of its own for the wavefronts that come next."""
-        return np.random.default_rng([*self.key[4:], self.count])
-
-
-def _seeds(seed: int, frame: int) -> _Seeds:
-    return _Seeds(hashlib.sha256(f"{seed} {frame}".encode()).digest())
 
 
 def _wide(values: NDArray[np.float32], samples: int, channels: int) -> NDArray[np.float32]:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from data.render.camera_paths import Jitter, jittered, keyframed, orbit
 from data.render.loading import load_file
+from data.render.scene_files import declared_sensors, scene_files, scene_files_hash
 from data.render.spec import SceneSpec, Shot, View
 from data.render.tracer import Tracer
+
+__all__ = ["CameraMove", "scene_files", "scene_files_hash", "user_scene"]
 
 NOT_STATED = "not stated"
 _TRIES = 48
@@ -99,57 +100,6 @@ def user_scene(path: Path, shot: Shot, move: CameraMove, seed: int) -> SceneSpec
     return replace(spec, views=_views(spec, shot, move, np.random.default_rng(seed)))
 
 
-def scene_files(path: Path) -> dict[str, str]:
-    """Return every file that a scene is made of, as its text names it → SHA-256.
-
-    Raises:
-        ValueError: A file is missing or the XML is broken; the message names both files.
-    """
-    path = Path(path)
-    found: dict[str, str] = {}
-    for name, file in _references(path, path.name, path.parent):
-        if not file.is_file():
-            what = f"scene {path} does not exist" if file == path else f"scene {path}: {name} is missing"
-            raise ValueError(f"{what}; expected at {file}" if file != path else f"{what}; name an XML file")
-        found[name] = _sha256(file)
-    return dict(sorted(found.items()))
-
-
-def scene_files_hash(path: Path) -> str:
-    """Return one SHA-256 of all files that a scene is made of; see `scene_files`."""
-    parts = "".join(f"{name}\0{digest}\n" for name, digest in scene_files(path).items())
-    return hashlib.sha256(parts.encode()).hexdigest()
-
-
-def _references(path: Path, name: str, root: Path) -> Iterator[tuple[str, Path]]:
-    """Yield a file and, if it is XML, what it refers to."""
-    yield name, path
-    if path.suffix.lower() != ".xml" or not path.is_file():
-        return
-    tree = _xml(path)
-    defaults = {e.get("name", ""): e.get("value", "") for e in tree.iter("default")}
-    for element in tree.iter():
-        value = element.get("filename") if element.tag == "include" else None
-        if element.tag == "string" and element.get("name") == "filename":
-            value = element.get("value")
-        if value is not None:
-            for variable in sorted(defaults, key=len, reverse=True):
-                value = value.replace(f"${variable}", defaults[variable])
-            yield from _references(root / value, value, root)
-
-
-def _xml(path: Path) -> Any:
-    try:
-        return ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"scene {path}: not valid XML: {error}") from None
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _name(path: Path) -> str:
     """Return the name of the file; that of its folder where the file is called scene.xml."""
     resolved = path.resolve()
@@ -175,7 +125,7 @@ def _file_view(path: Path, shot: Shot) -> View:
     import mitsuba
 
     scene = load_file(path)
-    declared = [element.get("type") for element in _sensors(path, path.parent)]
+    declared = [element.get("type") for element in declared_sensors(path, path.parent)]
     if not declared:
         raise ValueError(f'scene {path} has no camera; add a <sensor type="perspective">')
     if declared[0] not in _SENSORS:
@@ -197,15 +147,6 @@ def _file_view(path: Path, shot: Shot) -> View:
         value("aperture_radius", 0.0),
         value("focus_distance", 1.0),
     )
-
-
-def _sensors(path: Path, root: Path) -> Iterator[Any]:
-    tree = _xml(path)
-    yield from tree.iter("sensor")
-    for element in tree.iter("include"):
-        inner = root / (element.get("filename") or "")
-        if inner.is_file():
-            yield from _sensors(inner, root)
 
 
 def _views(spec: SceneSpec, shot: Shot, move: CameraMove, rng: np.random.Generator) -> tuple[View, ...]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data.render.camera_paths import Jitter, jittered, keyframed, look_at, orbit
-from data.render.guides import view_world_to_pixel
+from data.render.projection import view_world_to_pixel
 from tests.data.render import scenes
 
 
