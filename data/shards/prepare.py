@@ -176,12 +176,12 @@ def _check_samples(records: list[ShardRecord]) -> None:
     Raises:
         ValueError: They do not.
     """
-    kinds = {record.per_sample: record for record in reversed(records) if record.samples}
+    kinds: dict[tuple[int, tuple[str, ...]] | None, str] = {}
+    for record in records:
+        if record.samples:
+            kinds.setdefault(record.per_sample, f"{record.scene} ({record.split})")
     if len(kinds) > 1:
-        told = [
-            f"{record.scene} ({record.split}) has {_kind_text(kind)}"
-            for kind, record in list(kinds.items())[:2]
-        ]
+        told = [f"{where} has {_kind_text(kind)}" for kind, where in list(kinds.items())[:2]]
         raise ValueError(
             f"frames that keep different samples apart cannot be in one set of shards: {' and '.join(told)}; "
             "choose frames with --spp N, or leave samples out with --samples none"

@@ -22,14 +22,21 @@ CHANNELS = sample_channels("radiance", "normal", "roughness")
 """Channels of the samples of `with_samples`, all of which half precision holds."""
 
 
-def frame(scene: str, index: int, width: int = 48, height: int = 40, scale: float = 1.0) -> Frame:
-    """A static view (motion 0) whose depth numbers the pixels; light differs from frame to frame."""
+def frame(
+    scene: str, index: int, width: int = 48, height: int = 40, scale: float = 1.0, calm: bool = False
+) -> Frame:
+    """A static view (motion 0) whose depth numbers the pixels; light differs from frame to frame.
+
+    `calm`: the left half has neither noise nor texture.
+    """
     generator = np.random.default_rng([len(scene), index])
     shape = (height, width)
     albedo = generator.uniform(0.2, 0.9, (*shape, 3)).astype(np.float16).astype(np.float32)
     light = generator.exponential(scale, (*shape, 1)).astype(np.float32)
     normal = np.zeros((*shape, 3), np.float32)
     normal[..., 2] = 1
+    if calm:
+        albedo[:, : width // 2], light[:, : width // 2] = 0.5, scale
     color, reference = albedo * light, albedo * np.float32(scale)
     if scale < 1000:
         color, reference = (x.astype(np.float16).astype(np.float32) for x in (color, reference))
@@ -50,7 +57,7 @@ def frame(scene: str, index: int, width: int = 48, height: int = 40, scale: floa
 
 
 def with_samples(made: Frame, count: int, depth: bool = False, bright: float = 0.0) -> Frame:
-    """Return the frame with so many samples; `bright` is added to one value of their radiance."""
+    """Return the frame with so many samples; `bright` is added to the radiance of the first."""
     generator = np.random.default_rng([made.index, count])
     shape = (count, made.height, made.width)
     parts = {
@@ -58,7 +65,7 @@ def with_samples(made: Frame, count: int, depth: bool = False, bright: float = 0
         "normal": generator.uniform(-1, 1, (*shape, 3)).astype(np.float32),
         "roughness": generator.random((*shape, 1), np.float32),
     }
-    parts["radiance"][0, 0, 0, 0] += bright
+    parts["radiance"][0] += np.float32(bright)
     if depth:
         parts["depth"] = generator.uniform(1, 9, (*shape, 1)).astype(np.float32)
     return replace(made, samples=Samples.of(parts))
@@ -92,6 +99,7 @@ def write_set(
     sequence: bool = True,
     black: tuple[str, int] | None = None,
     scale: float = 1.0,
+    calm: bool = False,
 ) -> Path:
     """Write an ingested data set; `black` names a frame whose reference is black."""
     splits = splits or SPLITS
@@ -99,7 +107,7 @@ def write_set(
     for scene in (name for names in splits.values() for name in names):
         records = []
         for index in range(frames):
-            made = frame(scene, index, *size, scale=scale)
+            made = frame(scene, index, *size, scale=scale, calm=calm)
             if black == (scene, index):
                 made = made.with_buffers(reference=np.zeros_like(made.buffers["reference"]))
             records.append(write_record(made, root))

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import types
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -97,10 +98,16 @@ def test_the_result_does_not_depend_on_the_number_of_processes(frames, expected,
     assert content(tmp_path / "shards") == expected
 
 
-def run_until(frames: Path, output: Path, processes: int, shards: int) -> int:
+def run_until(
+    frames: Path,
+    output: Path,
+    processes: int,
+    shards: int,
+    options: Sequence[str] = ("--samples-per-shard", "4"),
+) -> int:
     """Start the command, end it with SIGKILL once so many shards are finished; return how many were."""
     arguments = [sys.executable, "-m", "trainer.cli", "prepare", str(frames), "--output", str(output)]
-    arguments += [*ARGUMENTS, "--samples-per-shard", "4", "--processes", str(processes)]
+    arguments += [*ARGUMENTS, *options, "--processes", str(processes)]
     code = "import sys, time; from data.shards import cut; write = cut.write_json\n"
     code += "def slow(*a):\n    time.sleep(0.1); write(*a)\n"
     code += "cut.write_json = slow\nfrom trainer.cli import main\nsys.exit(main())"
