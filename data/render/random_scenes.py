@@ -161,11 +161,10 @@ def random_scene(seed: int, kind: Kind, shot: Shot, assets: Assets | None = None
 def _origin(source: _Source, shot: Shot, assets: Assets | None) -> dict[str, Any]:
     """Return what makes the scene again, as plain JSON."""
     files = {p.name: digest for p, digest in sorted(source.used.items())}
-    own = (
-        {"hash": assets.hash, "share": assets.share, "used": files, "skipped": source.skipped}
-        if assets
-        else None
-    )
+    own = None
+    if assets is not None:
+        skipped = [said.replace(str(p), p.name) for p, said in sorted(source.skipped.items())]
+        own = {"hash": assets.hash, "share": assets.share, "used": files, "skipped": skipped}
     return {
         "generator": "penumbra",
         "version": GENERATOR_VERSION,

@@ -1,9 +1,11 @@
 """Procedural environments as latitude-longitude pictures (256, 512): skies, studios, interiors, gradients.
 
 As Mitsuba's `envmap` has it, the first row is straight up (+Y) and the last straight down, and columns are
-half a pixel from the picture's edge: the first looks along -Z, a quarter of the width further is +X. The clear sky is a gradient of our own with the ingredients of A. Preetham, P. Shirley,
-B. Smits, A practical analytic model for daylight, SIGGRAPH 1999, DOI 10.1145/311535.311545: darker and bluer
-away from the horizon, a bright halo around the sun, everything redder as the sun sinks.
+half a pixel from the picture's edge: the first looks along -Z, a quarter of the width further is +X.
+
+The clear sky is a gradient of our own with the ingredients of A. Preetham, P. Shirley, B. Smits, A practical
+analytic model for daylight, SIGGRAPH 1999, DOI 10.1145/311535.311545: darker and bluer away from the horizon,
+a bright halo around the sun, everything redder as the sun sinks.
 """
 
 from __future__ import annotations
