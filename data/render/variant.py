@@ -39,7 +39,7 @@ _FOLDERS = (
 _INSTALL = (
     f"install a package with libLLVM 16 or newer, such as libllvm19, or set {LIBRARY} to the file of one"
 )
-_SLOWER = "about 5 times slower for radiance alone and 100 times slower with guides"
+_SLOWER = "3 to 5 times slower for radiance alone, 100 to 300 times with guides"
 _SECONDS = 300
 
 
