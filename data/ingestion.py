@@ -35,6 +35,9 @@ from data.manifest import (
 PARTIAL = ".partial"
 """Folder inside the output that remembers finished frames until the manifest is written."""
 
+REMARKS = ("derived", "decoded", "normalised", "clipped", "assumed", "camera")
+"""Notes of a frame that are kept in its record."""
+
 Progress = Callable[[int, int, str], None]
 
 
@@ -119,7 +122,7 @@ def write_record(
 ) -> FrameRecord:
     """Write a frame to its place in a data set and return its record.
 
-    `view`, `reference_spp`, `repaired` and `checks` are taken from the frame's notes.
+    `view`, `reference_spp`, `repaired`, `checks` and `remarks` are taken from the frame's notes.
 
     Raises:
         ValueError: The frame has no exposure, or lacks a named buffer.
@@ -150,6 +153,7 @@ def write_record(
         reference_spp=told.get("reference_spp"),
         samples=[] if frame.samples is None else list(frame.samples.names),
         checks=told.get("checks", {}),
+        remarks={key: told[key] for key in REMARKS if told.get(key)},
     )
 
 

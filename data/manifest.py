@@ -38,6 +38,8 @@ class FrameRecord:
         reference_spp: Samples per pixel of `reference`, None where unknown.
         samples: Quantities that are kept per sample, empty where samples are not kept apart.
         checks: What was measured when the frame was made, such as `energy_z` and `reference_relmse`.
+        remarks: What its layout did to stored buffers or took for granted: `derived`, `decoded`,
+            `normalised`, `clipped`, `assumed`, `camera`.
     """
 
     index: int
@@ -55,6 +57,7 @@ class FrameRecord:
     reference_spp: int | None = None
     samples: list[str] = field(default_factory=list)
     checks: dict[str, float] = field(default_factory=dict)
+    remarks: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,7 @@ class Manifest:
         for scene in values["scenes"].values():
             _drop_empty(scene, ("origin",))
             for frame in scene["frames"]:
-                _drop_empty(frame, ("view", "reference_spp", "samples", "checks"))
+                _drop_empty(frame, ("view", "reference_spp", "samples", "checks", "remarks"))
         return {"format": FORMAT, "version": VERSION, **values}
 
     @staticmethod

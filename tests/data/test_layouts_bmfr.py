@@ -5,7 +5,7 @@ import pytest
 
 from data.derive import derive
 from data.exr import write_exr
-from data.layouts import bmfr, layout, likeliest
+from data.layouts import bmfr, likeliest
 from data.layouts.bmfr_camera import read_cameras
 from tests.data.miniature import BMFR_FILES, Crop, bmfr_scene, camera_header, sample_crop, write_rgb
 
@@ -216,5 +216,3 @@ def test_likeness_and_errors_for_folders_of_another_kind(tmp_path):
         bmfr.describe(tmp_path / "x")
     with pytest.raises(FileNotFoundError):
         bmfr.describe(tmp_path / "none")
-    with pytest.raises(ValueError, match="unknown layout 'kpcn'; known: bmfr, penumbra"):
-        layout("kpcn")

@@ -11,6 +11,7 @@ from data.exr import read_frame
 from data.frames import FrameSet
 from data.ingestion import PARTIAL, IngestOptions, ingest
 from data.manifest import MANIFEST
+from tests.data import layout_samples as layer_samples
 from tests.data.miniature import (
     BMFR_FILES,
     Crop,
@@ -305,3 +306,22 @@ def test_a_folder_that_resembles_no_layout_is_refused_with_the_layouts(tmp_path)
     (tmp_path / "x" / "notes.txt").write_text("nothing")
     with pytest.raises(ValueError, match=r"resembles none of the layouts .*oidn.*--layout"):
         call(tmp_path / "x", "--output", tmp_path / "set")
+
+
+def test_what_a_layout_assumed_and_normalised_is_in_the_record_and_the_report(tmp_path, capsys):
+    layer_samples.layerdenoise(tmp_path / "source")
+    assert call(tmp_path / "source", "--output", tmp_path / "set", "--processes", 1) == 0
+    manifest = FrameSet(tmp_path / "set").manifest
+    record = next(iter(manifest.scenes.values())).frames[0]
+    assert record.remarks["normalised"] == ["depth"]
+    assert record.remarks["assumed"]
+    out = capsys.readouterr().out
+    assert "normalised by the source, no scene units: depth" in out
+    assert "assumed: " in out
+    assert "stored per sample: radiance, " in out
+
+
+def test_a_normal_that_was_decoded_is_in_the_report(tmp_path, capsys):
+    layer_samples.oidn_view(tmp_path / "source", "view", ("4spp", "64spp"), encoded=True)
+    assert call(tmp_path / "source", "--layout", "oidn", "--output", tmp_path / "set", "--processes", 1) == 0
+    assert "decoded: normal, 2 n - 1" in capsys.readouterr().out

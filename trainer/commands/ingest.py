@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,6 +114,8 @@ def report(manifest: Manifest, output: Path) -> None:
             derived |= frame.derived
     for name, rule in derived.items():
         console.print(f"derived on reading: {name} = {rule}", highlight=False, soft_wrap=True)
+    for line in remarks(manifest):
+        console.print(line, highlight=False, soft_wrap=True)
     for name, count in repaired.items():
         console.print(f"repaired: {count} pixels of {name} were NaN or Inf", highlight=False, soft_wrap=True)
     console.print(
@@ -121,6 +123,27 @@ def report(manifest: Manifest, output: Path) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def remarks(manifest: Manifest) -> list[str]:
+    """Return what the layout did to buffers or took for granted, a sentence for each, over all frames."""
+    said: dict[str, str] = {}
+    clipped: Counter[str] = Counter()
+    for frame in (f for scene in manifest.scenes.values() for f in scene.frames):
+        told = frame.remarks
+        said |= {f"derived {n}": f"derived and stored: {n} = {rule}" for n, rule in _pairs(told, "derived")}
+        said |= {f"decoded {n}": f"decoded: {n}, {how}" for n, how in _pairs(told, "decoded")}
+        said |= {f"assumed {n}": f"assumed: {n} {what}" for n, what in _pairs(told, "assumed")}
+        for name in told.get("normalised", ()):
+            said[f"normalised {name}"] = f"normalised by the source, no scene units: {name}"
+        clipped.update(told.get("clipped", {}))
+    lines = [f"clipped: {count} values of {name} were out of range" for name, count in clipped.items()]
+    return [*said.values(), *lines]
+
+
+def _pairs(told: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
+    values = told.get(key, {})
+    return list(values.items()) if isinstance(values, dict) else [(name, "") for name in values]
 
 
 def scene_table(manifest: Manifest) -> Any:
