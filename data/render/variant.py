@@ -143,7 +143,9 @@ def probe(library: str) -> str | None:
         verdict = json.loads(record.read_text())["verdict"]
     except (OSError, ValueError, KeyError, TypeError):
         verdict = _try(library)
-        _remember(record, {"library": library, "verdict": verdict})
+        if verdict is None or "signal" in verdict or "too old" in verdict:
+            # Any other failure may be of the moment: a full disk, a broken installation.
+            _remember(record, {"library": library, "verdict": verdict})
     return None if verdict is None else str(verdict)
 
 
