@@ -20,7 +20,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-MODULES = ("training_step", "reconstruction", "loader", "inference", "quality")
+MODULES = ("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality")
 RESULTS = Path("bench") / "results.json"
 
 
