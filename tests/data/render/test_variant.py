@@ -65,10 +65,19 @@ def test_a_verdict_is_kept_until_the_file_changes(cache, tmp_path, monkeypatch):
 def test_a_broken_record_is_tried_again(cache, tmp_path, monkeypatch):
     library = tmp_path / "libLLVM-77.so"
     library.write_bytes(b"x")
-    monkeypatch.setattr(variant, "_try", lambda _: "broken")
-    assert probe(str(library)) == "broken"
+    monkeypatch.setattr(variant, "_try", lambda _: "signal 6")
+    assert probe(str(library)) == "signal 6"
     (record,) = cache.iterdir()
     record.write_text("{")
+    monkeypatch.setattr(variant, "_try", lambda _: None)
+    assert probe(str(library)) is None
+
+
+def test_a_failure_of_the_moment_is_not_kept(cache, tmp_path, monkeypatch):
+    library = tmp_path / "libLLVM-77.so"
+    library.write_bytes(b"x")
+    monkeypatch.setattr(variant, "_try", lambda _: "exit code 1 (OSError: disk full)")
+    assert probe(str(library)) == "exit code 1 (OSError: disk full)"
     monkeypatch.setattr(variant, "_try", lambda _: None)
     assert probe(str(library)) is None
 
