@@ -74,7 +74,7 @@ def _sources(name: str) -> list[Source]:
 
 def _options(name: str) -> RenderOptions:
     cores = len(os.sched_getaffinity(0))
-    processes = max(1, cores // 2)
+    processes = max(min(cores, 2), cores // 2)
     return RenderOptions(choose(), processes, max(1, cores // processes), test=TEST[name])
 
 

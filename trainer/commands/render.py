@@ -37,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _scene_arguments(parser.add_argument_group("scenes"))
     _image_arguments(parser.add_argument_group("images"))
     work = parser.add_argument_group("work")
-    work.add_argument("--processes", type=int, help="rendering processes (default: one per two cores)")
+    work.add_argument(
+        "--processes", type=int, help="rendering processes (default: one per two cores, at least two)"
+    )
     work.add_argument("--variant", choices=tuple(VARIANTS), default="auto", help="of Mitsuba")
     work.add_argument(
         "--dry-run", action="store_true", help="print what would be rendered, its size and time"
@@ -109,9 +111,10 @@ def run(args: argparse.Namespace) -> int:
     variant = choose(VARIANTS[args.variant])
     print(f"Mitsuba's variant: {variant.reason}", flush=True)
     cores = len(os.sched_getaffinity(0))
-    processes = args.processes or max(1, cores // 2)
-    if processes < 1:
-        raise ValueError(f"--processes {args.processes}: expected at least 1")
+    if args.processes is not None and args.processes < 1:
+        raise UsageError(f"--processes {args.processes}: expected at least 1")
+    # Loading a scene and compiling its kernels use one core, so that more processes keep more cores busy.
+    processes = args.processes or max(min(cores, 2), cores // 2)
     if args.dry_run:
         return _dry_run(args, recipe, sources, variant, processes)
     options = RenderOptions(
