@@ -16,8 +16,8 @@ ENERGY_LIMIT = 4.0
 """Standard errors beyond which the mean of a noisy frame counts as different from that of its reference: one
 frame in 5000 with three channels of normal noise."""
 
-RELATIVE_FLOOR = 0.01
-"""Added to the squared reference where its relative error is estimated."""
+RELATIVE_FLOOR = 1e-4
+"""Added to the squared reference where its relative error is estimated, as in the metric `relmse_layer`."""
 
 
 @dataclass
@@ -97,10 +97,14 @@ class Reference:
         spread = np.maximum(self.squares / self.count - mean * mean, 0)
         return spread * self.count / max(self.count - 1, 1)
 
-    def relative_error(self) -> float:
-        """Return the reference's own noise: the mean of its variance over (reference^2 + 0.01)."""
-        mean = self.total[..., :3] / self.count
-        return float((self.sample_variance() / self.count / (mean * mean + RELATIVE_FLOOR)).mean())
+    def relative_error(self, exposure: float) -> float:
+        """Return the reference's own noise: the mean of its variance over (reference^2 + 1e-4).
+
+        Both are exposed, so that it is what the reference adds to the metric `relmse_layer` of any image.
+        """
+        mean = exposure * self.total[..., :3] / self.count
+        variance = exposure * exposure * self.sample_variance() / self.count
+        return float((variance / (mean * mean + RELATIVE_FLOOR)).mean())
 
 
 def energy_z(noisy: Image, spp: int, reference: Reference) -> float:

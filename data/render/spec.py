@@ -106,8 +106,8 @@ class SceneSpec:
         views: One per frame.
         moving: Id of a shape in `content` → its linear displacement over one shutter (3,), scene units.
             A shape is where `content` says at the middle of the shutter of frame 0, and moves on from there
-            from frame to frame: at frame i and time t in [0, 1) it is displaced by
-            `displacement * (i + t - 0.5)`.
+            from frame to frame of a path: at frame i and time t in [0, 1) it is displaced by
+            `displacement * (i + t - 0.5)`. Independent views (`path` is False) are all of frame 0's moment.
         path: Consecutive frames of one camera path.
         origin: Everything needed to make this scene again: generator, version, seed, kind, options, hashes of
             files. Plain JSON; jobs are keyed by it.

@@ -174,7 +174,7 @@ class Tracer:
 
         view = setting.view
         render: Any = mitsuba.render
-        self._loaded.displace(frame)
+        self._loaded.displace(self._shutters(frame))
         together = max(1, self._chunk // (view.width * view.height))
         for first in range(0, spp, together):
             images = [
@@ -198,11 +198,15 @@ class Tracer:
         """Return `count` samples of every pixel of some rows."""
         shape = (count, band.stop - band.start, setting.view.width)
         if setting.still or not self._loaded.moving:
-            self._loaded.displace(frame)
+            self._loaded.displace(self._shutters(frame))
             flat = self._wavefront(setting, band.start, np.arange(int(np.prod(shape))), seeds.next(), None)
         else:
             flat = self._slices(setting, frame, band.start, shape, seeds)
         return {name: values.reshape(*shape, -1) for name, values in flat.items()}
+
+    def _shutters(self, frame: int) -> int:
+        """Return how many shutters have passed at a frame; independent views are all of the same moment."""
+        return frame if self.spec.path else 0
 
     def _slices(
         self, setting: _Frame, frame: int, top: int, shape: tuple[int, int, int], seeds: Seeds
@@ -218,7 +222,7 @@ class Tracer:
             if not lanes.size:
                 continue
             time = (place + 0.5) / SLICES
-            self._loaded.displace(frame + time - 0.5)
+            self._loaded.displace(self._shutters(frame) + time - 0.5)
             for name, values in self._wavefront(setting, top, lanes, own, time).items():
                 result[name][lanes] = values
         return result

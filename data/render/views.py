@@ -136,17 +136,17 @@ def _finished(work: ViewWork, record: FrameRecord, reference: Reference) -> Fram
     added = {"reference": target}
     if work.recipe.kind == "stills":
         added["reference_diffuse"] = reference.diffuse()
-    spp = record.spp or work.recipe.spp[-1]
+    spp, exposure = record.spp or work.recipe.spp[-1], automatic_exposure(target)
     notes = {
         "view": record.view,
         "reference_spp": reference.count,
         "checks": {
             "energy_z": round(energy_z(noisy_color(frame), spp, reference), 3),
-            "reference_relmse": float(f"{reference.relative_error():.4g}"),
+            "reference_relmse": float(f"{reference.relative_error(exposure):.4g}"),
             "invalid_samples": float(reference.invalid),
         },
     }
-    whole = replace(frame.with_buffers(**added), exposure=automatic_exposure(target), notes=notes)
+    whole = replace(frame.with_buffers(**added), exposure=exposure, notes=notes)
     return write_record(whole, work.root)
 
 
