@@ -77,5 +77,5 @@ def _repair(values: NDArray[np.float32], channels: tuple[str, ...]) -> int:
     number = int(bad.sum())
     if number:
         fills = [SAMPLE_BUFFERS[channel.partition(".")[0]].no_hit for channel in channels]
-        values[bad] = np.broadcast_to(np.float32(fills), values.shape)[bad]
+        values[bad] = np.broadcast_to(np.asarray(fills, np.float32), values.shape)[bad]
     return number

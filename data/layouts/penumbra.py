@@ -1,8 +1,9 @@
 """Layout of Penumbra's first renders: `<scene>/f000_{input,samples,reference,low}.exr` with `sequence.json`.
 
 `video` sets have one noisy colour per frame and a moving camera; `stills` have two halves, variances and
-independent views; `layers` keep their samples apart, in `samples` instead of `input`. In these files `albedo` and `specular` are the diffuse and specular reflectance of the
-first hit, `depth` is the distance from the camera's centre, and the sidecar holds cameras and exposures.
+independent views; `layers` keep their samples apart, in `samples` instead of `input`. In these files `albedo`
+and `specular` are the diffuse and specular reflectance of the first hit, `depth` is the distance from the
+camera's centre, and the sidecar holds cameras and exposures.
 """
 
 from __future__ import annotations

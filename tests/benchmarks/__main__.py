@@ -20,7 +20,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-MODULES = ("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality")
+MODULES = (
+    *("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality"),
+    *("rendering", "procedural"),
+)
 RESULTS = Path("bench") / "results.json"
 
 

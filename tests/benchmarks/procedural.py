@@ -14,8 +14,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from models.denoiser import Denoiser
 from tests.benchmarks.quality import score
 from tests.benchmarks.timing import Row, row
 from trainer.loading import load_model
@@ -69,10 +70,11 @@ def run() -> list[dict[str, Any]]:
     shards = FOLDER / "shards"
     if not (shards / "index.json").is_file():
         _trainer("prepare", str(FOLDER / "sequences"), "--output", str(shards), "--train-patches", "320")
-    scores = {
-        "procedural sequences": score(load_model(str(train("random", "--data.root", str(shards)))))[0],
-        "real sequences": score(load_model(str(train("real"))))[0],
+    trained = {
+        "procedural sequences": train("random", "--data.root", str(shards)),
+        "real sequences": train("real"),
     }
+    scores = {name: score(cast(Denoiser, load_model(str(path))))[0] for name, path in trained.items()}
     for name, table in scores.items():
         for metric in ("psnr_wskp", "ssim_wskp", "relmse_layer"):
             value = table["WSKP"][metric]
