@@ -4,28 +4,35 @@ Renders 24 stills, 5 sequences of 8 frames and 8 frames of samples below `bench/
 kept, so a second run only tests), trains WSKP on the sequences and on the real sample for equally many steps,
 and tests both on the real held-out scene.
 
-    python -m tests.benchmarks.procedural
+    python -m tests.benchmarks.procedural [--picture FILE]
 """
 
 from __future__ import annotations
 
-import json
+import argparse
 import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+from PIL import Image
+
+from data.frames import FrameSet
+from data.manifest import load_manifest
+from data.render.recipe import Recipe
+from data.render.rendering import remembered_speed
 from models.denoiser import Denoiser
 from tests.benchmarks.quality import score
-from tests.benchmarks.timing import Row, row
+from tests.benchmarks.timing import Row, print_table, row
 from trainer.loading import load_model
 from trainer.runs import find_checkpoint
 
 FOLDER = Path("bench") / "procedural"
 SETS = {
     "stills": "--random 24 --seed 1001 --size 128x128 --spp 4 8 16 32 --reference-spp 128",
-    "sequences": "--random 5 --seed 2001 --frames 8 --size 256x144 --reference-spp 128 --test outdoor-002005",
+    "sequences": "--random 5 --seed 2001 --frames 8 --size 256x144 --reference-spp 64 --test outdoor-002005",
     "samples": "--random 8 --seed 3001 --size 96x96 --reference-spp 256",
 }
 STEPS = 1080
@@ -33,14 +40,16 @@ STEPS = 1080
 
 
 def render() -> dict[str, float]:
-    """Render what is missing and return the minutes that each set took, those of the first complete run."""
-    times = FOLDER / "minutes.json"
-    minutes: dict[str, float] = json.loads(times.read_text()) if times.is_file() else {}
+    """Render what is missing and return the minutes of each set, by the speed of the call that rendered it."""
+    minutes = {}
     for kind, options in SETS.items():
-        began = time.monotonic()
-        _trainer("render", kind, *options.split(), "--output", str(FOLDER / kind))
-        minutes.setdefault(kind, (time.monotonic() - began) / 60)
-        times.write_text(json.dumps(minutes))
+        root = FOLDER / kind
+        _trainer("render", kind, *options.split(), "--output", str(root))
+        manifest = load_manifest(root)
+        known = {name: value for name, value in manifest.recipe["recipe"].items() if name != "version"}
+        recipe = Recipe(**{**known, "spp": tuple(known["spp"])})
+        views = manifest.frame_count // (len(recipe.spp) if kind == "stills" else 1)
+        minutes[kind] = views * recipe.samples_per_view() / (remembered_speed(root) or float("nan")) / 60
     return minutes
 
 
@@ -84,7 +93,26 @@ def run() -> list[dict[str, Any]]:
     return rows
 
 
-if __name__ == "__main__":
-    from tests.benchmarks.timing import print_table
+def picture(path: Path, columns: int = 6) -> None:
+    """Write the references of all stills side by side."""
+    frames = FrameSet(FOLDER / "stills")
+    tiles = [tone_mapped(frames, scene) for scene in frames.scenes()]
+    rows = [np.concatenate(tiles[i : i + columns], 1) for i in range(0, len(tiles), columns)]
+    Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
 
-    print_table(run())
+
+def tone_mapped(frames: FrameSet, scene: str) -> np.ndarray:
+    """Return the reference of a scene's last frame, exposed and with gamma, uint8 (H, W, 3)."""
+    frame = frames.read(scene, frames.frames(scene)[-1].index)
+    exposed = np.clip(frame.buffers["reference"] * (frame.exposure or 1.0), 0, 1)
+    return (255 * exposed ** (1 / 2.2)).astype(np.uint8)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--picture", type=Path, help="write the stills' references and nothing else")
+    options = parser.parse_args()
+    if options.picture:
+        picture(options.picture)
+    else:
+        print_table(run())
