@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,7 +39,7 @@ STEPS = 1080
 
 
 def render() -> dict[str, float]:
-    """Render what is missing and return the minutes of each set, by the speed of the call that rendered it."""
+    """Render what is missing and return the minutes of each set, by the speed that its call recorded."""
     minutes = {}
     for kind, options in SETS.items():
         root = FOLDER / kind
