@@ -1,8 +1,8 @@
 """Figure 4 of rendering: a data set from random scenes, and what WSKP learns from it.
 
 Renders 24 stills, 5 sequences of 8 frames and 8 frames of samples below `bench/procedural` (what is there is
-kept, so a second run only tests), trains WSKP on the sequences and on the real sample for equally many steps,
-and tests both on the real held-out scene.
+kept, so a second run only tests), trains WSKP on the sequences for as many steps as `wskp_bmfr.yaml` does on
+the real sample, and tests both on the real held-out scene.
 
     python -m tests.benchmarks.procedural [--picture FILE]
 """
@@ -23,7 +23,7 @@ from data.manifest import load_manifest
 from data.render.recipe import Recipe
 from data.render.rendering import remembered_speed
 from models.denoiser import Denoiser
-from tests.benchmarks.quality import score
+from tests.benchmarks.quality import checkpoint, score
 from tests.benchmarks.timing import Row, print_table, row
 from trainer.loading import load_model
 from trainer.runs import find_checkpoint
@@ -80,7 +80,7 @@ def run() -> list[dict[str, Any]]:
         _trainer("prepare", str(FOLDER / "sequences"), "--output", str(shards), "--train-patches", "320")
     trained = {
         "procedural sequences": train("random", "--data.root", str(shards)),
-        "real sequences": train("real"),
+        "real sequences": checkpoint()[0],
     }
     scores = {name: score(cast(Denoiser, load_model(str(path))))[0] for name, path in trained.items()}
     for name, table in scores.items():
