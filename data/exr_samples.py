@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from data.buffers import SAMPLE_BUFFERS, sample_channels
 from data.exr_image import HALF_MAX, ExrImage
 from data.frame import Samples
+from data.repair import all_finite
 
 _CHANNEL = re.compile(r"s(\d{2,4})\.(.+)")
 _FOREIGN = {"color": "radiance", "albedo": "diffuse_albedo", "specular": "specular_albedo"}
@@ -73,6 +74,8 @@ def write_samples(samples: Samples) -> dict[str, NDArray[Any]]:
 
 
 def _repair(values: NDArray[np.float32], channels: tuple[str, ...]) -> int:
+    if all_finite(values):
+        return 0
     bad = ~np.isfinite(values)
     number = int(bad.sum())
     if number:
