@@ -14,8 +14,20 @@ from data.render.moments import Moments, at_counts, over_hits
 from data.render.recipe import Recipe
 from data.render.spec import SceneSpec
 
-HALVES = ("radiance", "diffuse", "normal", "diffuse_albedo", "depth", "visibility")
+HALVES = (
+    "radiance",
+    "diffuse",
+    "specular",
+    "normal",
+    "diffuse_albedo",
+    "specular_albedo",
+    "depth",
+    "visibility",
+)
 """Quantities of stills that are stored with two halves and the variance of the mean."""
+
+FOLLOWING = ("color", "specular", "specular_a", "specular_b")
+"""Buffers of stills that are left out, since they follow from others: specular is color - diffuse."""
 
 _NAMES = {"radiance": "color"}
 _OVER_HITS = ("depth", "position")
@@ -75,7 +87,7 @@ def noisy_frames(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> list[
         frame.samples = samples
         return [frame]
     frames = []
-    stream = ((chunk.rows, chunk.values) for chunk in chunks)
+    stream = ((chunk.rows, _with_specular(chunk.values)) for chunk in chunks)
     for level, (count, moments) in enumerate(at_counts(stream, recipe.spp, (recipe.height, recipe.width))):
         buffers = _still(moments) if recipe.kind == "stills" else _means(moments)
         frames.append(_frame(tracer, view, view * len(recipe.spp) + level, count, buffers))
@@ -105,15 +117,20 @@ def _means(moments: Mapping[str, Moments]) -> dict[str, Image]:
 
 
 def _still(moments: Mapping[str, Moments]) -> dict[str, Image]:
-    """Return means, halves and variances; the colour's mean follows from its halves and is left out."""
+    """Return means, halves and variances, without those that follow from others."""
     buffers = _means(moments)
-    del buffers["color"]
     for name in HALVES:
         stored = _NAMES.get(name, name)
         for half in "ab":
             buffers[f"{stored}_{half}"] = moments[name].half(half)
         buffers[f"{stored}_variance"] = moments[name].variance()
-    return buffers
+    return {name: image for name, image in buffers.items() if name not in FOLLOWING}
+
+
+def _with_specular(values: Mapping[str, NDArray[np.float32]]) -> Mapping[str, NDArray[np.float32]]:
+    if "diffuse" not in values:
+        return values
+    return {**values, "specular": values["radiance"] - values["diffuse"]}
 
 
 def _kept_apart(chunks: Iterator[Any], recipe: Recipe) -> tuple[dict[str, Image], Samples]:

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from data.derive import derive
 from data.exr import read_frame
 from data.manifest import FrameRecord
 from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
@@ -193,3 +194,16 @@ def test_keys_depend_on_scene_view_and_recipe_but_not_on_the_reference_samples()
 def test_recipes_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         with_options(defaults("stills"), **options)
+
+
+def test_specular_light_has_its_own_variance_and_follows_from_the_rest(tmp_path):
+    done = work(tmp_path, Recipe("stills", 24, 16, (32,), 64))
+    render(done)
+    frame = derive(read_frame(tmp_path / records(done)[0].file), ["color", "specular"])
+    assert np.allclose(
+        frame.buffers["specular"], np.maximum(frame.buffers["color"] - frame.buffers["diffuse"], 0), atol=2e-3
+    )
+    # In this tracer both parts are independent, so that their variances add up to the specular one's.
+    expected = frame.buffers["color_variance"].mean() + frame.buffers["diffuse_variance"].mean()
+    assert frame.buffers["specular_variance"].mean() == pytest.approx(expected, rel=0.05)
+    assert "specular_albedo_variance" in frame.buffers
