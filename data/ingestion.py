@@ -19,7 +19,8 @@ from data.derive import automatic_exposure, derive
 from data.exr import write_frame
 from data.frame import Frame
 from data.frames import derivable
-from data.layouts import layout, likeliest
+from data.layouts import closer, layout
+from data.layouts.channels import MissingBufferError
 from data.layouts.scene import Scene
 from data.manifest import (
     MANIFEST,
@@ -161,13 +162,13 @@ def _scenes(name: str, root: Path) -> list[Scene]:
     module = layout(name)
     try:
         scenes: list[Scene] = module.describe(root)
+    except MissingBufferError:
+        raise
     except ValueError as error:
-        other = likeliest(root) if root.is_dir() else None
-        if other is None or other == name:
+        hint = closer(root, name)
+        if not hint:
             raise
-        raise ValueError(
-            f"{error}. The folder looks like the layout `{other}`: use --layout {other}"
-        ) from error
+        raise ValueError(f"{error}{hint}") from error
     for scene in scenes:
         if scene.name != Path(scene.name).name or scene.name.startswith("."):
             raise ValueError(f"{root}: scene name {scene.name!r} cannot be the name of a folder")

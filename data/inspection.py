@@ -38,6 +38,9 @@ def inspect_path(path: str | Path) -> dict[str, Any]:
     if path.is_file():
         if path.name in (MANIFEST, INDEX):
             return inspect_path(path.parent)
+        name = likeliest(path)
+        if name is not None:
+            return _layout(path, name)
         return {"kind": "file", "path": str(path), **describe_frame(read_frame(path))}
     if (path / MANIFEST).is_file():
         return _data_set(path)

@@ -40,11 +40,27 @@ def layout(name: str) -> Any:
 
 
 def likenesses(root: str | Path) -> dict[str, float]:
-    """Return how much a folder resembles each layout, those that it resembles at all, best first."""
-    scores = {name: layout(name).likeness(Path(root)) for name in LAYOUTS}
+    """Return how much a folder resembles each layout, those that it resembles at all, best first.
+
+    Folders that cannot be read resemble nothing.
+    """
+    scores = {name: _likeness(name, Path(root)) for name in LAYOUTS}
     return dict(sorted(((n, s) for n, s in scores.items() if s > 0), key=lambda pair: -pair[1]))
+
+
+def _likeness(name: str, root: Path) -> float:
+    try:
+        return float(layout(name).likeness(root))
+    except OSError:
+        return 0.0
 
 
 def likeliest(root: str | Path) -> str | None:
     """Return the layout that a folder resembles most, None where it resembles none."""
     return next(iter(likenesses(root)), None)
+
+
+def closer(root: str | Path, name: str) -> str:
+    """Return what to add to an error where a folder resembles another layout than the named one."""
+    other = likeliest(root)
+    return "" if other in (None, name) else f"; it looks like the layout `{other}`: use --layout {other}"

@@ -37,6 +37,10 @@ def channel_groups(channels: Iterable[str]) -> dict[str, list[str]]:
     return {group: sorted(members, key=_rank) for group, members in groups.items()}
 
 
+class MissingBufferError(ValueError):
+    """A buffer is absent; the message says already which layout looks closer."""
+
+
 def missing_buffer(layout: str, place: str | Path, name: str, found: Iterable[str], root: Path) -> ValueError:
     """Return an error for a buffer that is absent and cannot be derived.
 
@@ -47,14 +51,11 @@ def missing_buffer(layout: str, place: str | Path, name: str, found: Iterable[st
         found: Channels or files that are there.
         root: Folder of the source, to see which other layouts it resembles.
     """
-    from data.layouts import likenesses
+    from data.layouts import closer
 
-    listed = _some(found)
-    scores = likenesses(root) if root.is_dir() else {}
-    own = scores.pop(layout, 0.0)
-    closer = [f"`{other}`" for other, score in scores.items() if score > own]
-    hint = f"; it looks closer to the layout {' or '.join(closer)}" if closer else ""
-    return ValueError(f"{place}: missing {name}; found {listed or 'nothing'}{hint}")
+    return MissingBufferError(
+        f"{place}: missing {name}; found {_some(found) or 'nothing'}{closer(root, layout)}"
+    )
 
 
 @dataclass

@@ -18,7 +18,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +30,7 @@ from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.hdf5 import dataset, items, names, open_hdf5
 from data.layouts.samples import clean, mean_of_hits, mean_variance, means
 from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.walk import LOOK, files_below
 
 if TYPE_CHECKING:
     import h5py
@@ -53,14 +53,14 @@ _ASSUMED = {
     "motion": "normalised device coordinates times half the image's size, y as stored",
     "coc": "the stored radius times 2, taken for pixels",
 }
-_MOST_LISTED = 4096
+_ENDINGS = (".h5", ".hdf5")
 
 
 def likeness(root: Path) -> float:
     """Return the fraction of HDF5 files below a root that are inputs or references by name."""
     if not root.is_dir():
         return 0.0
-    paths = list(islice((p for p in root.rglob("*") if p.suffix in (".h5", ".hdf5")), _MOST_LISTED))
+    paths = files_below(root, _ENDINGS, LOOK)
     inputs = [p for p in paths if _INPUT.fullmatch(p.name)]
     known = set(inputs) | {r for p in inputs if (r := _reference(p)) is not None}
     return len(known) / len(paths) if paths else 0.0
@@ -76,7 +76,7 @@ def describe(root: str | Path) -> list[Scene]:
     """
     root = Path(root)
     require_folder(root)
-    inputs = sorted(p for p in root.rglob("*") if _INPUT.fullmatch(p.name) and _is_visible(root, p))
+    inputs = [p for p in files_below(root, _ENDINGS) if _INPUT.fullmatch(p.name)]
     if not inputs:
         raise ValueError(
             f"{root}: no file of the layout `layerdenoise` found, expected <name>_input.h5 (or <name>_in.h5) "
@@ -116,10 +116,6 @@ def read(scene: str, path: Path, reference: Path | None, index: int) -> Frame:
     frame.samples = kept
     frame.validate()
     return frame
-
-
-def _is_visible(root: Path, path: Path) -> bool:
-    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)
 
 
 def _scene(root: Path, path: Path) -> Scene:

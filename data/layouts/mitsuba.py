@@ -19,7 +19,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +31,9 @@ from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.mitsuba_names import MOMENT, Roles, roles_of
 from data.layouts.scene import Scene, all_frames, require_folder
 from data.layouts.twins import Job, SceneFiles, scenes_of
+from data.layouts.walk import LOOK, files_below
 
 _UNIT_SHARE = 0.75
-_MOST_LISTED = 256
 _MOST_OPENED = 4
 
 
@@ -42,7 +41,7 @@ def likeness(root: Path) -> float:
     """Return the fraction of a few EXR files below a root that look like an AOV film."""
     if not root.is_dir():
         return 0.0
-    paths = list(islice((p for p in root.rglob("*.exr") if p.is_file()), _MOST_LISTED))
+    paths = files_below(root, (".exr",), LOOK)
     opened = paths[:: max(1, len(paths) // _MOST_OPENED)][:_MOST_OPENED]
     return sum(_score(p) for p in opened) / len(opened) if opened else 0.0
 

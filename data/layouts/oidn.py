@@ -18,7 +18,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from data.exr_image import read_exr
 from data.frame import Frame
 from data.layouts.channels import DEFAULT, Gathering, channel_groups
 from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.walk import LOOK, files_below
 
 _FILE = re.compile(
     r"(?P<name>.+?)(?:_(?P<version>\d+(?:spp)?|ref|reference|gt|target))?\.(?P<feature>[a-z][a-z0-9]{1,5})\.exr",
@@ -37,7 +37,6 @@ _FEATURES = {"hdr": "color", "alb": "diffuse_albedo", "nrm": "normal"}
 _KNOWN = (*_FEATURES, "ldr", "sh1", "sh1x", "sh1y", "sh1z", "shl1x", "shl1y", "shl1z", "dpt")
 _REFERENCE = -1
 _PLAIN = 0
-_MOST_LISTED = 4096
 _SPACE = "world space; this layout does not say, and allows view space"
 
 
@@ -66,7 +65,7 @@ def likeness(root: Path) -> float:
     """Return the fraction of EXR files below a root that are named like features of this layout."""
     if not root.is_dir():
         return 0.0
-    paths = list(islice((p for p in root.rglob("*.exr") if p.is_file()), _MOST_LISTED))
+    paths = files_below(root, (".exr",), LOOK)
     known = [p for p in paths if _parts(p) is not None]
     if not any(p.name.lower().endswith(".hdr.exr") for p in known):
         return 0.0
@@ -156,10 +155,8 @@ def _parts(path: Path) -> tuple[str, int, str] | None:
 def _views(root: Path) -> dict[str, tuple[Path, str | None, tuple[View, ...]]]:
     """Return scene → its folder, its only image where it has one, and its views."""
     scenes: dict[str, tuple[Path, str | None, tuple[View, ...]]] = {}
-    for folder in sorted({root, *(path.parent for path in root.rglob("*.exr"))}):
+    for folder in sorted({root, *(path.parent for path in files_below(root, (".exr",)))}):
         below = folder.relative_to(root).parts
-        if any(part.startswith(".") for part in below):
-            continue
         names: list[str | None] = [None] if below else list(_images(folder, folder.stat().st_mtime_ns))
         for only in names:
             members = _members(folder, only)

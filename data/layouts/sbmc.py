@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import astuple
 from functools import lru_cache, partial
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -30,6 +29,7 @@ from data.layouts.channels import Gathering
 from data.layouts.samples import clean, mean_of_hits, mean_variance, means
 from data.layouts.sbmc_tile import FLAGS, VERTICES, TileHeader, read_header, read_tile
 from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.walk import LOOK, files_below
 
 MAX_FRAME_BYTES = 1 << 30
 """Samples of a joined frame; larger images stay tiles."""
@@ -54,7 +54,6 @@ _PLANES = {
 _MEANS = ("diffuse", "normal", "diffuse_albedo", "visibility", "hit")
 _VARIANCES = ("diffuse", "normal", "diffuse_albedo")
 _SHARED = slice(0, 13)
-_MOST_LISTED = 4096
 _ASSUMED = {
     "normal": "camera space, as the authors' renderer writes it",
     "depth": "divided by ten scene radii",
@@ -67,7 +66,7 @@ def likeness(root: Path) -> float:
         return float(root.suffix == ".txt" and _lists_tiles(root))
     if not root.is_dir():
         return 0.0
-    paths = list(islice((p for p in root.rglob("*") if p.is_file()), _MOST_LISTED))
+    paths = files_below(root, most=LOOK)
     tiles = [p for p in paths if p.suffix == ".bin"]
     if not tiles or not any(_is_tile(p) for p in tiles[:8]):
         return 0.0
@@ -129,8 +128,7 @@ def read(scene: str, folder: Path, names: tuple[str, ...], index: int) -> Frame:
 
 def _found(root: Path) -> list[Path]:
     require_folder(root)
-    paths = sorted(p for p in root.rglob("*.bin") if p.is_file())
-    paths = [p for p in paths if not any(part.startswith(".") for part in p.relative_to(root).parts)]
+    paths = [p for p in files_below(root, (".bin",)) if p.suffix == ".bin"]
     if not paths:
         raise ValueError(
             f"{root}: no tile of the layout `sbmc` found, expected <scene>/*.bin, or a .txt file that lists "

@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from data.layouts.channels import REFERENCE_WORDS
+from data.layouts.walk import files_below
 
 _WORDS = rf"(?P<word>{'|'.join(REFERENCE_WORDS)}|noisy|inputs?|(?P<spp>\d{{1,9}})_?spp)"
 _WORD = re.compile(rf"(?:^|(?<=[_\-. ])){_WORDS}(?=$|[_\-. ])", re.IGNORECASE)
@@ -67,14 +68,11 @@ def scenes_of(root: Path) -> dict[str, SceneFiles]:
         ValueError: Two references, or two noisy images of as many samples, of one frame; names both.
     """
     frames: dict[tuple[str, str], list[_Version]] = {}
-    for path in sorted(root.rglob("*")):
-        below = path.relative_to(root)
-        hidden = any(part.startswith(".") for part in below.parts)
-        if path.suffix.lower() == ".exr" and not hidden and path.is_file():
-            folders, stem, version = _parsed(path, below)
-            prefix, number = _numbered(stem)
-            scene = "-".join(filter(None, (*folders, prefix))) or root.resolve().name
-            frames.setdefault((scene, number), []).append(version)
+    for path in files_below(root, (".exr",)):
+        folders, stem, version = _parsed(path, path.relative_to(root))
+        prefix, number = _numbered(stem)
+        scene = "-".join(filter(None, (*folders, prefix))) or root.resolve().name
+        frames.setdefault((scene, number), []).append(version)
     scenes: dict[str, dict[str, list[_Version]]] = {}
     for (scene, number), versions in sorted(frames.items()):
         scenes.setdefault(scene, {})[number] = versions

@@ -1,10 +1,15 @@
+import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from data.frames import FrameSet
+from data.ingestion import IngestOptions, ingest
+from data.inspection import inspect_path
 from data.layouts import LAYOUTS, layout, likeliest, likenesses
+from data.layouts.walk import files_below
 from data.manifest import load_manifest
 from tests.data import layout_samples
 from tests.data.layout_miniatures import MINIATURES, acfm, kpcn, nbgd, shot, tungsten, write_one
@@ -129,6 +134,81 @@ def test_the_wrong_layout_is_told_the_right_one(tmp_path, monkeypatch, capsys):
     source = kpcn(tmp_path / "source")
     assert call(monkeypatch, "ingest", source, "--layout", "tungsten", "--output", tmp_path / "set") == 1
     assert "looks like the layout `kpcn`: use --layout kpcn" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("title", KNOWN)
+def test_every_wrong_layout_is_told_the_right_one_once(tmp_path, title):
+    source, right = tmp_path / "source", title.split()[0]
+    KNOWN[title](source)
+    for name in LAYOUTS:
+        try:
+            ingest(name, source, tmp_path / "set", IngestOptions(buffers=("none",)))
+        except (ValueError, OSError) as error:
+            text = str(error)
+            told = text.count("looks like the layout") + text.count("use --layout")
+            assert told == (0 if "unknown buffer" in text else 2), text
+            assert told == 0 or text.endswith(f"looks like the layout `{right}`: use --layout {right}")
+
+
+def test_a_list_of_tiles_is_recognised_inspected_and_ingested(tmp_path, monkeypatch, capsys):
+    source = layout_samples.sbmc(tmp_path / "source")
+    tiles = sorted(str(p.relative_to(source)) for p in source.rglob("*.bin"))
+    (source / "list.txt").write_text("\n".join(tiles))
+    assert likenesses(source / "list.txt") == {"sbmc": 1.0}
+    assert inspect_path(source / "list.txt")["layout"] == "sbmc"
+    assert call(monkeypatch, "ingest", source / "list.txt", "--output", tmp_path / "set") == 0
+    assert "layout sbmc" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"list\.txt is a file.* looks like the layout `sbmc`"):
+        ingest("oidn", source / "list.txt", tmp_path / "other")
+
+
+def test_a_look_at_a_large_folder_passes_over_few_entries(tmp_path, monkeypatch):
+    for number in range(12):
+        folder = tmp_path / f"p{number:02d}" / "deep"
+        folder.mkdir(parents=True)
+        for name in range(5):
+            (folder / f"{name}.bin").touch()
+    opened = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: opened.append(folder) or scandir(folder))
+    assert len(files_below(tmp_path, (".bin",), 30)) == 6
+    assert len(opened) == 1 + 12 + 2
+    assert len(files_below(tmp_path, (".bin",))) == 60
+    for name in LAYOUTS:
+        opened.clear()
+        monkeypatch.setattr(f"data.layouts.{name}.LOOK", 30, raising=False)
+        assert layout(name).likeness(tmp_path) == 0
+        assert len(opened) <= 40, name
+
+
+def test_hidden_files_and_links_to_folders_are_passed_over_and_links_in_a_circle_end(tmp_path):
+    (tmp_path / "a" / ".cache").mkdir(parents=True)
+    for name in ("a/0001.EXR", "a/.cache/0002.exr", "a/.0003.exr", "b.exr"):
+        (tmp_path / name).touch()
+    (tmp_path / "a" / "circle").symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "broken.exr").symlink_to(tmp_path / "nowhere")
+    found = [str(p.relative_to(tmp_path)) for p in files_below(tmp_path, (".exr",))]
+    assert found == ["a/0001.EXR", "b.exr"]
+
+
+def test_a_folder_that_cannot_be_read_resembles_nothing_but_is_not_left_out_unsaid(tmp_path, monkeypatch):
+    source = layout_samples.blender(tmp_path / "source")
+    locked = source / "locked"
+    locked.mkdir()
+
+    def refuse(of):
+        def listed(folder):
+            if Path(folder) == locked:
+                raise PermissionError(13, "Permission denied", str(folder))
+            return of(folder)
+
+        return listed
+
+    monkeypatch.setattr(os, "scandir", refuse(os.scandir))
+    monkeypatch.setattr(Path, "iterdir", refuse(Path.iterdir))
+    assert likeliest(source) == "blender"
+    with pytest.raises(PermissionError, match="locked"):
+        layout("blender").describe(source)
 
 
 def test_hidden_folders_are_no_scenes(tmp_path):

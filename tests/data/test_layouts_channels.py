@@ -91,6 +91,6 @@ def test_the_error_for_a_missing_buffer_lists_a_few_channels_and_closer_layouts(
     found = [f"x{i}.R" for i in range(30)]
     error = str(missing_buffer("kpcn", "a.exr", "buffer 'depth'", found, acfm(tmp_path)))
     assert error.startswith("a.exr: missing buffer 'depth'; found x0.R, x1.R, ")
-    assert error.endswith("x15.R and 14 more; it looks closer to the layout `acfm`")
-    assert "closer" not in str(missing_buffer("acfm", "a.exr", "buffer 'depth'", found, tmp_path))
+    assert error.endswith("x15.R and 14 more; it looks like the layout `acfm`: use --layout acfm")
+    assert "looks like" not in str(missing_buffer("acfm", "a.exr", "buffer 'depth'", found, tmp_path))
     assert str(missing_buffer("acfm", "a.exr", "buffer 'x'", [], tmp_path)).endswith("found nothing")

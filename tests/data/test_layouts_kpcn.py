@@ -159,7 +159,9 @@ def test_channels_without_a_meaning_are_listed(tmp_path):
 
 def test_a_layout_that_looks_closer_is_named_with_the_buffer(tmp_path):
     acfm(tmp_path)
-    with pytest.raises(ValueError, match=r"missing buffer .*; it looks closer to the layout `acfm`"):
+    with pytest.raises(
+        ValueError, match=r"missing buffer .*; it looks like the layout `acfm`: use --layout acfm"
+    ):
         kpcn.describe(tmp_path)
 
 

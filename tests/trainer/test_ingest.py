@@ -308,6 +308,22 @@ def test_a_folder_that_resembles_no_layout_is_refused_with_the_layouts(tmp_path)
         call(tmp_path / "x", "--output", tmp_path / "set")
 
 
+def test_a_folder_of_several_data_sets_is_told_what_its_subfolders_are(penumbra, bmfr, tmp_path):
+    (tmp_path / "both").mkdir()
+    penumbra.rename(tmp_path / "both" / "a")
+    bmfr.rename(tmp_path / "both" / "b")
+    with pytest.raises(ValueError, match=r"resembles none .*; in it, a/ is penumbra, b/ is bmfr: name one"):
+        call(tmp_path / "both", "--output", tmp_path / "set")
+
+
+def test_one_view_is_not_called_views():
+    assert [command.frames_text(n, s) for n, s in ((1, False), (2, False), (8, True))] == [
+        "1 view",
+        "2 views",
+        "8",
+    ]
+
+
 def test_what_a_layout_assumed_and_normalised_is_in_the_record_and_the_report(tmp_path, capsys):
     layer_samples.layerdenoise(tmp_path / "source")
     assert call(tmp_path / "source", "--output", tmp_path / "set", "--processes", 1) == 0

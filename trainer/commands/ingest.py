@@ -21,9 +21,15 @@ KNOWN = (
 )
 
 
+_SUBFOLDERS = 16
+"""Subfolders that are looked at where the root itself resembles nothing."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options."""
-    parser.add_argument("root", type=Path, metavar="ROOT", help="folder of the source")
+    parser.add_argument(
+        "root", type=Path, metavar="ROOT", help="folder of the source (sbmc: or a .txt list of tiles)"
+    )
     parser.add_argument(
         "--layout",
         default="auto",
@@ -86,13 +92,27 @@ def _resembled(root: Path) -> str:
     from data.layouts import LAYOUTS, likenesses
     from data.layouts.scene import require_folder
 
-    require_folder(root)
+    if not root.is_file():
+        require_folder(root)
     scores = likenesses(root)
     if not scores:
-        raise ValueError(f"{root} resembles none of the layouts {', '.join(LAYOUTS)}; name one with --layout")
+        below = "" if root.is_file() else _resembled_below(root)
+        raise ValueError(
+            f"{root} resembles none of the layouts {', '.join(LAYOUTS)}; "
+            + (f"in it, {below}: name one of these" if below else "name one with --layout")
+        )
     name, *others = scores
     print(f"layout {name}" + (f" (less likely: {', '.join(others)})" if others else ""))
     return name
+
+
+def _resembled_below(root: Path) -> str:
+    """Return which of the first subfolders resemble a layout, for a root that holds several data sets."""
+    from data.layouts import likeliest
+
+    folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    found = {folder.name: likeliest(folder) for folder in folders[:_SUBFOLDERS]}
+    return ", ".join(f"{name}/ is {layout}" for name, layout in found.items() if layout)
 
 
 def report(manifest: Manifest, output: Path) -> None:
@@ -160,12 +180,17 @@ def scene_table(manifest: Manifest) -> Any:
         table.add_row(
             name,
             manifest.split_of(name),
-            f"{len(scene.frames)}{'' if scene.sequence else ' views'}",
+            frames_text(len(scene.frames), scene.sequence),
             f"{first.width}x{first.height}",
             f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}",
             "?" if first.spp is None else str(first.spp),
         )
     return table
+
+
+def frames_text(count: int, sequence: bool) -> str:
+    """Return the number of a scene's frames: 8, 1 view, 2 views."""
+    return str(count) if sequence else f"{count} view{'s' if count > 1 else ''}"
 
 
 @contextmanager

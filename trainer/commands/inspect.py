@@ -98,7 +98,7 @@ def _require_data_set(path: Path) -> None:
     wanted = "--html shows a data set, that is a folder made by `trainer ingest` or `trainer render`"
     if (path / INDEX).is_file():
         raise ValueError(f"{path} holds shards; {wanted}: name the one that they were prepared from")
-    layout = likeliest(path) if path.is_dir() else None
+    layout = likeliest(path)
     if layout is not None:
         raise ValueError(f"{path} has the layout {layout}; {wanted}: ingest it first, with --layout {layout}")
     raise ValueError(f"{path} is no data set (it has no {MANIFEST}); {wanted}")
@@ -164,6 +164,8 @@ def _print_set(found: Mapping[str, Any], console: Console) -> None:
     from rich import box
     from rich.table import Table
 
+    from trainer.commands.ingest import frames_text
+
     _line(console, f"{found['path']}: data set {found['name']!r}, {found['frames']} frames")
     _line(console, f"layout {found['layout']}, depth {found['depth']}, hash {found['hash']}")
     _line(console, "; ".join(f"{split}: {', '.join(s) or 'none'}" for split, s in found["splits"].items()))
@@ -175,7 +177,7 @@ def _print_set(found: Mapping[str, Any], console: Console) -> None:
         table.add_row(
             name,
             s["split"],
-            f"{s['frames']}{'' if s['sequence'] else ' views'}",
+            frames_text(s["frames"], s["sequence"]),
             f"{s['width']}x{s['height']}",
             f"{s['bytes'] / 1e6:.2f}",
             f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}",
