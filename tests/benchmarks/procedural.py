@@ -97,7 +97,7 @@ def picture(path: Path, columns: int = 6) -> None:
     frames = FrameSet(FOLDER / "stills")
     tiles = [tone_mapped(frames, scene) for scene in frames.scenes()]
     rows = [np.concatenate(tiles[i : i + columns], 1) for i in range(0, len(tiles), columns)]
-    Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
+    Image.fromarray(np.concatenate(rows)).save(path, quality=90)
 
 
 def tone_mapped(frames: FrameSet, scene: str) -> np.ndarray:
