@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +30,7 @@ from data.manifest import (
     make_splits,
     write_json,
 )
+from data.parallel import results
 
 PARTIAL = ".partial"
 """Folder inside the output that remembers finished frames until the manifest is written."""
@@ -184,13 +183,14 @@ def _scenes(name: str, root: Path) -> list[Scene]:
 def _check_options(options: IngestOptions) -> None:
     for name in options.buffers or ():
         buffer(name)
-    if options.exposure not in ("layout", "auto"):
-        try:
-            number = float(options.exposure)
-        except ValueError:
-            number = 0.0
-        if not 0 < number < float("inf"):
-            raise ValueError(f"exposure {options.exposure!r}: expected layout, auto or a positive number")
+    if options.exposure in ("layout", "auto"):
+        return
+    try:
+        good = 0 < float(options.exposure) < float("inf")
+    except ValueError:
+        good = False
+    if not good:
+        raise ValueError(f"exposure {options.exposure!r}: expected layout, auto or a positive number")
 
 
 def _prepare_output(output: Path, name: str, root: Path, options: IngestOptions) -> None:
@@ -251,38 +251,21 @@ def remove_set(output: Path) -> None:
 def _write_all(
     scenes: list[Scene], output: Path, options: IngestOptions, progress: Progress | None
 ) -> dict[tuple[str, int], FrameRecord]:
-    jobs = {(s.name, i): partial(_one, s, i, output, options) for s in scenes for i in s.indices}
+    frames = [(s.name, i) for s in scenes for i in s.indices]
+    work = partial(_one, {s.name: s for s in scenes}, output, options)
     records: dict[tuple[str, int], FrameRecord] = {}
-    for key, record in _results(jobs, options.processes):
+    for key, record in results(work, frames, options.processes):
         records[key] = record
         if progress is not None:
-            progress(len(records), len(jobs), f"{key[0]}/frame {key[1]}")
+            progress(len(records), len(frames), f"{key[0]}/frame {key[1]}")
     return records
 
 
-def _results(
-    jobs: Mapping[tuple[str, int], Callable[[], FrameRecord]], processes: int
-) -> Iterator[tuple[tuple[str, int], FrameRecord]]:
-    if processes <= 1:
-        for key, job in jobs.items():
-            yield key, job()
-        return
-    # spawn: the EXR library keeps threads, which do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
-        pending: dict[Future[FrameRecord], tuple[str, int]] = {pool.submit(j): k for k, j in jobs.items()}
-        try:
-            while pending:
-                done, _ = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield pending.pop(future), future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _one(scene: Scene, index: int, output: Path, options: IngestOptions) -> FrameRecord:
+def _one(
+    scenes: Mapping[str, Scene], output: Path, options: IngestOptions, key: tuple[str, int]
+) -> FrameRecord:
     """Write one frame, unless an earlier call did, and remember it."""
+    scene, index = scenes[key[0]], key[1]
     memory = output / PARTIAL / f"{scene.name}-{index:03d}.json"
     known = _remembered(memory, output)
     if known is not None:

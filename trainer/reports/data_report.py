@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
 from pathlib import Path
 
 from data.duplicates import near_duplicates
 from data.frames import FrameSet
 from data.manifest import Manifest
-from data.shards.processes import end_with_parent
+from data.parallel import results
 from trainer.outputs import refuse_existing, replacing
 from trainer.reports.data_page import column_frames, render, shown_frame
 from trainer.reports.findings import Finding, findings
@@ -75,38 +72,12 @@ def examine(frames: FrameSet, processes: int = 1, progress: Progress | None = No
         OSError: A process was ended from outside.
     """
     jobs = make_jobs(frames)
-    facts: list[FrameFacts | None] = [None] * len(jobs)
-    for done, (place, found) in enumerate(_results(jobs, min(processes, len(jobs))), 1):
-        facts[place] = found
+    facts: dict[tuple[str, int], FrameFacts] = {}
+    for job, found in results(look_at, jobs, processes, one_thread):
+        facts[job.scene, job.record.index] = found
         if progress is not None:
-            progress(done, len(jobs), f"{found.scene}/frame {found.record.index}")
-    return [f for f in facts if f is not None]
-
-
-def _results(jobs: list[FrameJob], processes: int) -> Iterator[tuple[int, FrameFacts]]:
-    if processes <= 1:
-        yield from ((i, look_at(job)) for i, job in enumerate(jobs))
-        return
-    # spawn: the EXR library keeps threads, which do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=_begin) as pool:
-        pending = {pool.submit(look_at, job): i for i, job in enumerate(jobs)}
-        try:
-            for future in as_completed(list(pending)):
-                yield pending.pop(future), future.result()
-        except BrokenProcessPool as error:
-            raise OSError(
-                "a process that reads frames was ended from outside, perhaps for want of memory; "
-                "use fewer --processes"
-            ) from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _begin() -> None:
-    end_with_parent()
-    one_thread()
+            progress(len(facts), len(jobs), f"{found.scene}/frame {found.record.index}")
+    return [facts[job.scene, job.record.index] for job in jobs]
 
 
 def make_jobs(frames: FrameSet) -> list[FrameJob]:
