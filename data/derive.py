@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
 
 import numpy as np
@@ -114,6 +114,50 @@ def derive(
     return result
 
 
+_LOOKED_AT = {
+    "irradiance": ("color", "albedo"),
+    "color": ("diffuse", "specular", "irradiance", "albedo"),
+    "depth": ("position", "normal"),
+    "motion": ("position", "normal"),
+    "diffuse": ("specular", "color", "irradiance"),
+    "specular": ("diffuse", "color", "irradiance"),
+    "hit": ("depth",),
+    **{
+        f"albedo{part}": (f"diffuse_albedo{part}", f"specular_albedo{part}")
+        for part in ("", "_a", "_b", "_variance")
+    },
+}
+"""Buffers that the rules of `derive` look at, beside halves and means."""
+
+
+def sources(names: Iterable[str], has: Collection[str]) -> set[str]:
+    """Return those buffers of a frame that `derive` looks at in order to make others.
+
+    Args:
+        names: What is to be made; what the frame has already stands for itself.
+        has: The buffers of the frame.
+
+    Returns:
+        Enough of `has` that `derive` makes the same from these alone.
+    """
+    found: set[str] = set()
+    seen: set[str] = set()
+    pending = list(names)
+    while pending:
+        name = pending.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        if name in has:
+            found.add(name)
+            continue
+        base, _, part = name.rpartition("_")
+        pending += _LOOKED_AT.get(name, ())
+        for mean in (name, base) if part in ("a", "b", "variance") else (name,):
+            pending += {mean, f"{mean}_a", f"{mean}_b"} & {*has, *_LOOKED_AT}
+    return found
+
+
 class _Context:
     """One call of `derive`: the growing frame and the parameters of its rules."""
 
@@ -139,7 +183,7 @@ class _Context:
         buffers = self.frame.buffers
         if name not in buffers:
             array, rule = self._of_halves(name) or self._rule(name)
-            buffers[name] = np.ascontiguousarray(array, np.float32)
+            buffers[name] = np.asarray(array, np.float32)
             self.frame.notes["derived"][name] = rule
         return buffers[name]
 
@@ -199,7 +243,7 @@ class _Context:
         position, camera = self.frame.buffers.get("position"), self.frame.camera
         if position is None or camera is None:
             raise self._fail("depth", "position" if position is None else "the camera")
-        depth = cameras.depth(camera, position, self.depth_kind)
+        depth = cameras.depth(camera, np.ascontiguousarray(position), self.depth_kind)
         depth = np.where(no_hit(self.frame), np.float32(0), np.maximum(depth, 0))
         rule = (
             "w of the projected position"
@@ -214,7 +258,7 @@ class _Context:
             raise self._fail(
                 "motion", "position" if position is None else "the camera of this or the last frame"
             )
-        motion = cameras.motion(position, camera, self.previous)
+        motion = cameras.motion(np.ascontiguousarray(position), camera, self.previous)
         return np.where(no_hit(self.frame), np.float32(0), motion), "position and both cameras"
 
     def _rest(self, name: str, other: str) -> tuple[Image, str]:

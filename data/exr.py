@@ -10,10 +10,10 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from data.exr_image import read_exr as read_exr
 from data.exr_image import write_exr as write_exr
 from data.exr_samples import is_sample, read_samples, write_samples
 from data.frame import Frame, Image
-from data.repair import repair
+from data.repair import all_finite, repair
 
 KNOWN_NAMINGS = (
     "<buffer>.R/.G/.B, .X/.Y/.Z or .Z with the buffers color, irradiance, albedo, diffuse_albedo, "
@@ -49,6 +49,24 @@ _STEMS = {
     "position": "position",
     "depth": "depth",
 }
+
+
+Halves = NDArray[np.float16]
+"""A buffer as half precision files hold it, finite, channels first (C, H, W)."""
+
+Choose = Callable[[Collection[str]], tuple[Collection[str], Collection[str]]]
+
+
+class StoredFrame(NamedTuple):
+    """A frame of which only what is computed with was converted to float32.
+
+    Attributes:
+        frame: The frame with those buffers.
+        halves: Name → a buffer as it is stored, in half precision.
+    """
+
+    frame: Frame
+    halves: dict[str, Halves]
 
 
 class RadianceWarning(UserWarning):
@@ -73,17 +91,42 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
     Warns:
         RadianceWarning: Radiance that looks 8-bit or tone-mapped.
     """
-    path = Path(path)
-    image = read_exr(path)
-    samples, invalid = read_samples(image, _MARK in image.attributes)
-    groups, ignored = _groups(image, only, samples is not None)
+    return _read(Path(path), only, None).frame
+
+
+def read_stored(path: str | Path, choose: Choose, samples: bool = True) -> StoredFrame:
+    """Read some of the buffers of a frame in our own naming, and convert no more than is computed with.
+
+    Args:
+        path: The file.
+        choose: Called with the names of the buffers in the file; returns those that are needed in float32,
+            and those that are passed on as they are stored where that is in half precision.
+        samples: Whether to read samples that are kept apart.
+
+    Returns:
+        The frame has the former in float32, its pixels lying channel by channel, and those of the latter
+        that are stored otherwise, do not fill the display window or had to be repaired.
+
+    Raises:
+        OSError: As `read_frame`.
+        ValueError: As `read_frame`.
+    """
+    return _read(Path(path), None, choose, samples)
+
+
+def _read(path: Path, only: str | None, choose: Choose | None, with_samples: bool = True) -> StoredFrame:
+    image = read_exr(path, keep_half=True)
+    own = _MARK in image.attributes
+    groups, ignored = _groups(image, only, any(map(is_sample, image.channels)))
+    samples, invalid = read_samples(image, own) if with_samples or not groups else (None, 0)
+    halves: dict[str, Halves] = {}
+    if choose is not None and groups and own:
+        groups, halves = _chosen(image, groups, choose)
     buffers, outside = {}, {}
     for name, channels in groups.items():
-        buffers[name] = np.stack([image.channels[c] for c in channels], -1)
-        hidden = image.outside.get(channels[0])
-        if hidden is not None:
-            buffers[name][hidden] = buffer(name).no_hit
-            outside[name] = int(hidden.sum())
+        buffers[name], hidden = _converted(image, name, channels, planar=choose is not None)
+        if hidden:
+            outside[name] = hidden
     buffers, repaired = repair(buffers)
     if invalid:
         repaired["samples"] = invalid
@@ -95,10 +138,42 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
     for key, value in (("repaired", repaired), ("ignored", ignored), ("outside_data_window", outside)):
         if value:
             frame.notes[key] = value
-    if _MARK not in image.attributes:  # our own files were looked at when they were made
+    if not own:  # our own files were looked at when they were made
         for name, array in buffers.items():
             _warn_unless_radiance(path, name, array)
-    return frame
+    return StoredFrame(frame, halves)
+
+
+def _chosen(
+    image: ExrImage, groups: dict[str, list[str]], choose: Choose
+) -> tuple[dict[str, list[str]], dict[str, Halves]]:
+    """Return the channels of the buffers to convert, at least one, and those that stay in half precision."""
+    computed, passed = choose(groups.keys())
+    halves = {}
+    for name in passed:
+        planes = [image.channels[channel] for channel in groups.get(name, ())]
+        kept = planes and all(p.dtype == np.float16 and all_finite(p) for p in planes)
+        if kept and not image.outside.keys() & set(groups[name]):
+            halves[name] = np.stack(planes)
+    wanted = {*computed, *passed} - (halves.keys() - set(computed))
+    found = {name: channels for name, channels in groups.items() if name in wanted}
+    return found or dict([next(iter(groups.items()))]), halves
+
+
+def _converted(image: ExrImage, name: str, channels: list[str], planar: bool) -> tuple[Image, int]:
+    """Return a buffer (H, W, C) and how many of its pixels lie outside the data window."""
+    shape = image.channels[channels[0]].shape
+    if planar:
+        array = np.empty((len(channels), *shape), np.float32).transpose(1, 2, 0)
+    else:
+        array = np.empty((*shape, len(channels)), np.float32)
+    for i, channel in enumerate(channels):
+        array[..., i] = image.channels[channel]
+    hidden = image.outside.get(channels[0])
+    if hidden is None:
+        return array, 0
+    array[hidden] = buffer(name).no_hit
+    return array, int(hidden.sum())
 
 
 def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = None) -> dict[str, str]:

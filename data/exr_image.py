@@ -53,8 +53,9 @@ class ExrImage:
 
     Attributes:
         path: The file.
-        channels: Full channel name → float32 (H, W); 0 outside the data window. In files of several parts a
-            channel without a layer is prefixed by the name of its part.
+        channels: Full channel name → float32 (H, W), or float16 where half channels were to stay so; 0
+            outside the data window. In files of several parts a channel without a layer is prefixed by the
+            name of its part.
         precision: Channel name → `half`, `float` or `uint`, as stored.
         outside: Channel name → bool (H, W), True outside the data window; only channels that do not fill it.
         attributes: Header attributes of the first part.
@@ -62,7 +63,7 @@ class ExrImage:
     """
 
     path: Path
-    channels: dict[str, NDArray[np.float32]]
+    channels: dict[str, NDArray[Any]]
     precision: dict[str, str]
     attributes: dict[str, Any]
     parts: list[str]
@@ -75,11 +76,15 @@ class ExrImage:
         return height, width
 
 
-def read_exr(path: str | Path) -> ExrImage:
+def read_exr(path: str | Path, keep_half: bool = False) -> ExrImage:
     """Read every channel of an EXR file.
 
     Half and float channels become float32, every part is read, and each data window is composed into the
     display window (cropped where it is larger, 0 where it is smaller).
+
+    Args:
+        path: The file.
+        keep_half: Half channels stay float16.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -107,7 +112,7 @@ def read_exr(path: str | Path) -> ExrImage:
         raise ValueError(f"{path}: truncated or damaged EXR file: pixels missing; copy or render it again")
     if not any(pixels for _, _, pixels in parts):
         raise ValueError(f"{path}: EXR file without channels")
-    return _compose(path, parts)
+    return _compose(path, parts, keep_half)
 
 
 def exr_channels(path: str | Path) -> list[str]:
@@ -257,18 +262,22 @@ def _pixels(part: Any, path: Path) -> dict[str, NDArray[Any]]:
     return pixels
 
 
-def _compose(path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArray[Any]]]]) -> ExrImage:
+def _compose(
+    path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArray[Any]]]], keep_half: bool
+) -> ExrImage:
     several = len(parts) > 1
     image = ExrImage(path, {}, {}, _attributes(parts[0][1]), [name for name, _, _ in parts])
-    for part, header, pixels in parts:
+    for part, header, channels in parts:
         (left, top), (right, bottom) = (np.asarray(v).tolist() for v in header["displayWindow"])
         size = (bottom - top + 1, right - left + 1)
-        for name, array in pixels.items():
+        for name, array in channels.items():
             full = _full_name(name, part, several, image.channels)
+            image.precision[full] = {"float16": "half", "float32": "float"}.get(array.dtype.name, "uint")
             origin = np.asarray(header["dataWindow"][0]) - (left, top)
+            if not (keep_half and array.dtype == np.float16):
+                array = array.astype(np.float32, copy=False)
             placed, outside = _place(array, int(origin[0]), int(origin[1]), size)
             image.channels[full] = placed
-            image.precision[full] = {"float16": "half", "float32": "float"}.get(array.dtype.name, "uint")
             if outside is not None:
                 image.outside[full] = outside
     return image
@@ -276,19 +285,17 @@ def _compose(path: Path, parts: list[tuple[str, dict[str, Any], dict[str, NDArra
 
 def _place(
     array: NDArray[Any], x: int, y: int, size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     height, width = size
-    # Half precision files may hold infinities that float32 cannot tell from overflow: kept, repaired later.
-    pixels = array.astype(np.float32)
     if (x, y) == (0, 0) and array.shape == size:
-        return pixels, None
-    placed = np.zeros(size, np.float32)
+        return array, None
+    placed = np.zeros(size, array.dtype)
     outside = np.ones(size, bool)
     rows = slice(max(y, 0), min(y + array.shape[0], height))
     columns = slice(max(x, 0), min(x + array.shape[1], width))
     if rows.start < rows.stop and columns.start < columns.stop:
         source = (slice(rows.start - y, rows.stop - y), slice(columns.start - x, columns.stop - x))
-        placed[rows, columns] = pixels[source]
+        placed[rows, columns] = array[source]
         outside[rows, columns] = False
     return placed, outside if outside.any() else None
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from data.derive import derive
-from data.exr import read_frame
+from data.buffers import buffer
+from data.derive import derive, sources
+from data.exr import StoredFrame, read_frame, read_stored
 from data.frame import Frame
 from data.manifest import FrameRecord, Manifest, file_sha256, load_manifest
 
@@ -62,16 +63,65 @@ class FrameSet:
             OSError: The file is missing; the message says which command repairs the set.
             ValueError: The file was altered, no such frame, or a named buffer cannot be derived.
         """
+        record = self._record(scene, index)
+        self._check(record, verify)
+        frame = self._labelled(read_frame(self.root / record.file), scene, record)
+        wanted = derivable(frame) if names is None else list(names)
+        return derive(frame, wanted, depth_kind=self.manifest.depth)
+
+    def read_stored(
+        self,
+        scene: str,
+        index: int,
+        names: Collection[str],
+        computed: Collection[str] = (),
+        *,
+        samples: bool = True,
+    ) -> StoredFrame:
+        """Read some buffers of a frame for storing them again, and derive those that are absent.
+
+        Args:
+            scene: Name of the scene.
+            index: Number of the frame.
+            names: Buffers that must be there. What the file holds of them in half precision stays so.
+            computed: Buffers that must be there in float32.
+            samples: Whether to read samples that are kept apart.
+
+        Returns:
+            The frame with `computed` and whatever of `names` is not in `halves`. Pixels lie channel by
+            channel.
+
+        Raises:
+            OSError: As `read`.
+            ValueError: As `read`.
+        """
+        record = self._record(scene, index)
+        self._check(record, True)
+
+        def choose(has: Collection[str]) -> tuple[Collection[str], Collection[str]]:
+            passed = [name for name in names if name in has and buffer(name).half]
+            return sources([n for n in (*names, *computed) if n not in passed or n in computed], has), passed
+
+        frame, halves = read_stored(self.root / record.file, choose, samples)
+        frame = self._labelled(frame, scene, record)
+        wanted = [name for name in (*names, *computed) if name not in halves or name in computed]
+        try:
+            return StoredFrame(derive(frame, wanted, depth_kind=self.manifest.depth), halves)
+        except ValueError:
+            self.read(scene, index, wanted, verify=False)  # fails too, and lists all buffers of the file
+            raise
+
+    def _record(self, scene: str, index: int) -> FrameRecord:
         record = next((f for f in self.frames(scene) if f.index == index), None)
         if record is None:
             known = [f.index for f in self.frames(scene)]
             raise ValueError(f"{self.root}: scene {scene!r} has no frame {index}; it has {known}")
-        self._check(record, verify)
-        frame = read_frame(self.root / record.file)
-        frame = replace(frame, scene=scene, index=index, exposure=record.exposure, spp=record.spp)
+        return record
+
+    def _labelled(self, frame: Frame, scene: str, record: FrameRecord) -> Frame:
+        frame = replace(frame, scene=scene, index=record.index, exposure=record.exposure, spp=record.spp)
         frame.notes["sequence"] = self.manifest.scenes[scene].sequence
-        wanted = derivable(frame) if names is None else list(names)
-        return derive(frame, wanted, depth_kind=self.manifest.depth)
+        return frame
 
     def sequence(self, scene: str, names: Iterable[str] | None = None) -> Iterator[Frame]:
         """Read the frames of a scene one after the other; `motion` is derived from the preceding camera."""

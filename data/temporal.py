@@ -64,7 +64,7 @@ def automatic_thresholds(frame: Frame) -> Thresholds:
     frame.require("position")
     if frame.camera is None:
         raise ValueError(f"{frame.label}: no camera, so its scale is unknown; give the position limit")
-    sizes = footprint(frame.camera, frame.buffers["position"])
+    sizes = footprint(frame.camera, np.ascontiguousarray(frame.buffers["position"]))
     hits = sizes[~no_hit(frame)[..., 0] & (sizes > 0)]
     size = float(np.median(hits)) if hits.size else 1.0
     return Thresholds((POSITION_LIMIT_FOOTPRINTS * size) ** 2, NORMAL_LIMIT_SQUARED)
@@ -190,7 +190,7 @@ def _previous_pixels(frame: Frame, last: Frame) -> tuple[NDArray[np.float32], st
         rows, columns = np.mgrid[0 : frame.height, 0 : frame.width].astype(np.float32)
         moved = np.stack([columns, rows], -1) + frame.buffers["motion"]
     if "position" in frame.buffers and "position" in last.buffers and last.camera is not None:
-        pixels, w = project(last.camera, frame.buffers["position"])
+        pixels, w = project(last.camera, np.ascontiguousarray(frame.buffers["position"]))
         offset = (0.5, 0.5) if frame.camera is None else frame.camera.offset
         pixels -= offset
         pixels[w <= 0] = np.nan

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from data.derive import derive
+from data.exr import StoredFrame
 from data.frame import Frame
 from data.frames import FrameSet
 from data.importance import importance_candidates, importance_map
@@ -49,8 +50,8 @@ def make_scene(
     left = Counter({plan.file: len(plan.samples) for plan in plans})
     with contextlib.ExitStack() as stack:
         writers: dict[str, ShardWriter] = {}
-        for frame in _frames(FrameSet(root), scene, options, set(wanted)):
-            cutter = _Cutter(frame, options)
+        for stored in _frames(FrameSet(root), scene, options, set(wanted)):
+            frame, cutter = stored.frame, _Cutter(stored, options)
             for plan, place in wanted.pop(frame.index):
                 if plan.file not in writers:
                     path = Path(work) / "shards" / plan.file
@@ -64,33 +65,59 @@ def make_scene(
                         report()
 
 
-def _frames(frames: FrameSet, scene: str, options: PrepareOptions, wanted: set[int]) -> Iterator[Frame]:
+def _frames(frames: FrameSet, scene: str, options: PrepareOptions, wanted: set[int]) -> Iterator[StoredFrame]:
     """Yield the wanted frames of a scene; accumulation has to read those before them too."""
     record = frames.manifest.scenes[scene]
-    last = max(wanted)
-    if not (options.accumulate and record.sequence):
-        for kept in record.frames:
-            if kept.index in wanted:
-                yield frames.read(scene, kept.index, _needed(kept, options))
+    samples = options.samples != "none"
+    if options.accumulate and record.sequence:
+        yield from _accumulated(frames, scene, options, wanted)
         return
-    for frame in _accumulated(frames, scene, **record.thresholds):
-        if frame.index in wanted:
-            yield frame
-        if frame.index >= last:
-            return
+    for kept in record.frames:
+        if kept.index in wanted:
+            computed = _known(kept, _looked_at(options))
+            if "depth" in kept.buffers:
+                computed.append("depth")
+            yield frames.read_stored(
+                scene, kept.index, _known(kept, options.stored), computed, samples=samples
+            )
 
 
-def _needed(record: FrameRecord, options: PrepareOptions) -> list[str]:
-    """Return those buffers that are stored or looked at, and that the frame has or lets derive."""
-    looked_at = ("color",) if options.sampling == "importance" else ()
-    names = dict.fromkeys((*options.stored, *looked_at))
+def _looked_at(options: PrepareOptions) -> tuple[str, ...]:
+    """Return what the choice of positions depends on."""
+    return ("color", "normal") if options.sampling == "importance" else ()
+
+
+def _known(record: FrameRecord, names: Iterable[str]) -> list[str]:
+    """Return those buffers that the frame has or lets derive."""
     return [name for name in names if name in record.buffers or name in record.derived]
 
 
-def _accumulated(frames: FrameSet, scene: str, **thresholds: float) -> Iterator[Frame]:
-    accumulator = Accumulator(**thresholds)
-    for frame in frames.sequence(scene):
-        yield frame if frame.accumulated else accumulator.step(frame)
+def _accumulated(
+    frames: FrameSet, scene: str, options: PrepareOptions, wanted: set[int]
+) -> Iterator[StoredFrame]:
+    found = frames.manifest.scenes[scene]
+    accumulator = Accumulator(**found.thresholds)
+    samples = options.samples != "none"
+    needed = ("irradiance", "position", "normal", "motion", "depth", *_looked_at(options))
+    for record in found.frames:
+        computed = _known(record, needed)
+        frame, halves = frames.read_stored(
+            scene, record.index, _known(record, options.stored), computed, samples=samples
+        )
+        if not frame.accumulated:
+            frame = accumulator.step(frame)
+            halves = {
+                name: planes for name, planes in halves.items() if name not in ("irradiance", "history")
+            }
+        if record.index in wanted:
+            yield StoredFrame(frame, halves)
+        if record.index >= max(wanted):
+            return
+
+
+def _planes(stored: StoredFrame, frame: Frame, name: str) -> Planes:
+    half = stored.halves.get(name)
+    return Planes.of(name, frame.buffers[name]) if half is None else Planes(name, half, True)
 
 
 @dataclass(frozen=True)
@@ -106,16 +133,16 @@ class _Cutter:
     """Cuts one frame.
 
     Args:
-        frame: With every buffer that is wanted.
+        stored: With every buffer that is wanted.
         options: How.
 
     Raises:
         ValueError: A buffer is missing or holds values that are not finite.
     """
 
-    def __init__(self, frame: Frame, options: PrepareOptions) -> None:
-        self.frame, self.options = frame, options
-        self.kept = _keep(frame, options)
+    def __init__(self, stored: StoredFrame, options: PrepareOptions) -> None:
+        self.frame, self.options = stored.frame, options
+        self.kept = _keep(stored, options)
         self._positions: dict[tuple[str, int], list[Position | None]] = {}
         self._map: Any = None
 
@@ -156,11 +183,13 @@ class _Cutter:
         return known
 
 
-def _keep(frame: Frame, options: PrepareOptions) -> _Kept:
-    frame.require("reference", *options.buffers)
-    if "history" in options.stored and "irradiance" in frame.buffers and not frame.accumulated:
+def _keep(stored: StoredFrame, options: PrepareOptions) -> _Kept:
+    frame, halves = stored
+    frame.require(*(name for name in ("reference", *options.buffers) if name not in halves))
+    single = not frame.accumulated and "history" not in halves
+    if single and "history" in options.stored and "irradiance" in frame.buffers.keys() | halves.keys():
         frame = derive(frame, ["history"])
-    buffers = {name: frame.buffers[name] for name in options.stored if name in frame.buffers}
+    has = frame.buffers.keys() | halves.keys()
     depth = frame.buffers.get("depth")
     meta = {
         "scene": frame.scene,
@@ -170,7 +199,7 @@ def _keep(frame: Frame, options: PrepareOptions) -> _Kept:
         "accumulated": frame.accumulated,
     }
     try:
-        planes = {name: Planes.of(name, array) for name, array in buffers.items()}
+        planes = {name: _planes(stored, frame, name) for name in options.stored if name in has}
         if frame.samples is None or options.samples == "none":
             return _Kept(planes, meta, None)
         planes[SAMPLES] = Planes.of_samples(frame.samples, options.samples == "half")

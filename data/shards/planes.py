@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from data.buffers import SAMPLE_BUFFERS, buffer
 from data.frame import Image, Samples
 from data.patches import Position
+from data.repair import all_finite
 
 HALF_MAX = 65504.0
 HALF_FLOOR = 2.0**-8
 """Arrays that are not zero but nowhere exceed this are kept in float32: half precision would have fewer than
 its 11 bits for values 1/64 of the largest and smaller."""
+
+_FLOOR = int(np.float16(HALF_FLOOR).view(np.uint16))
 
 SAMPLES = "samples"
 """Name under which the samples of each pixel are stored, (S, C, H, W)."""
@@ -41,23 +44,26 @@ class Planes:
 
     Args:
         name: The buffer, for messages.
-        values: float32 (C, H, W), or (S, C, H, W) of samples, in any memory order.
+        values: float32 (C, H, W), or (S, C, H, W) of samples, in any memory order; or float16, as it is
+            stored.
         half: Half precision is allowed.
 
     Raises:
         ValueError: A value is not finite; names the buffer.
     """
 
-    def __init__(self, name: str, values: NDArray[np.float32], half: bool) -> None:
-        low, high = float(values.min(initial=0)), float(values.max(initial=0))
-        if not (np.isfinite(low) and np.isfinite(high)):
+    def __init__(self, name: str, values: NDArray[Any], half: bool) -> None:
+        if not all_finite(values):
             raise ValueError(
                 f"buffer {name!r} has values that are not finite; ingest repairs them: trainer ingest"
             )
         self.values = values
-        self._all_in_range = max(high, -low) <= HALF_MAX
         self._half: NDArray[np.float16] | None = None
-        if half:
+        self._all_in_range = True
+        if values.dtype == np.float16:
+            self._half = values
+        elif half:
+            self._all_in_range = max(float(values.max(initial=0)), -float(values.min(initial=0))) <= HALF_MAX
             with np.errstate(over="ignore"):  # a patch with such a value is taken from `values`
                 self._half = values.astype("<f2", order="C")
 
@@ -86,26 +92,34 @@ class Planes:
 
         Outside of the frame a patch is 0.
         """
+        if self._half is None:
+            return _window(self.values, position, patch)
+        half = _window(self._half, position, patch)
+        # Most often one pixel tells that the patch is not among the subnormal numbers.
+        if self._all_in_range and _magnitude(half[..., half.shape[-2] // 2, half.shape[-1] // 2]) >= _FLOOR:
+            return half
+        if self.values is self._half:
+            largest = _magnitude(half)
+            return half if largest == 0 or largest >= _FLOOR else half.astype(np.float32)
         values = _window(self.values, position, patch)
-        if self._half is not None and self._fits(values):
-            return _window(self._half, position, patch)
-        return values
+        return half if _in_range(values) else values
 
     def black(self, position: Position, patch: int) -> bool:
         """Return whether a patch is 0 everywhere."""
         values = _window(self.values, position, patch)
+        if values.dtype == np.float16:
+            return _magnitude(values[..., values.shape[-2] // 2, :]) == 0 and _magnitude(values) == 0
         return not (values[..., values.shape[-2] // 2, :].any() or values.any())
-
-    def _fits(self, values: NDArray[np.float32]) -> bool:
-        # Most often one row tells that the patch is not among the subnormal numbers.
-        if self._all_in_range and np.abs(values[..., values.shape[-2] // 2, :]).max() >= HALF_FLOOR:
-            return True
-        return _in_range(values)
 
 
 def _in_range(array: NDArray[np.float32]) -> bool:
     largest = float(max(array.max(initial=0), -array.min(initial=0)))
     return largest == 0.0 or HALF_FLOOR <= largest <= HALF_MAX
+
+
+def _magnitude(array: NDArray[np.float16]) -> int:
+    """Return the bits of the largest magnitude, which order as the numbers do."""
+    return int((array.view(np.uint16) & 0x7FFF).max(initial=0))
 
 
 def _window(array: Stored, position: Position | None, patch: int) -> Stored:
