@@ -184,6 +184,8 @@ def _shards(root: Path) -> dict[str, Any]:
 
 def _shard_problem(root: Path, shard: Mapping[str, Any]) -> str | None:
     path = root / shard["file"]
+    if path.parent != root or path.name in ("", ".."):
+        return f"{root / INDEX} names {shard['file']!r}, which is no file of its folder; the index is damaged"
     if not path.is_file():
         return f"{path} is missing; run `trainer prepare` again"
     if path.stat().st_size != shard["bytes"] or file_sha256(path) != shard["sha256"]:
@@ -198,8 +200,8 @@ def _sampled(root: Path, shards: list[Mapping[str, Any]]) -> dict[str, Any]:
     found: dict[str, list[dict[str, Any]]] = {}
     for file, place in chosen:
         with (root / file).open("rb") as stream:
-            stream.seek(place["offset"])
-            data = stream.read(place["size"])
+            stream.seek(max(place["offset"], 0))
+            data = stream.read(min(place["size"], (root / file).stat().st_size))
         for name, values in _sample_statistics(data).items():
             found.setdefault(name, []).append(values)
     return {name: _merge(values) for name, values in found.items()}

@@ -1,4 +1,5 @@
 import argparse
+import contextlib
 import hashlib
 import io
 import json
@@ -147,6 +148,47 @@ def test_shards_are_described_from_their_index_and_a_few_samples(tmp_path, capsy
 def test_a_truncated_shard_is_reported_and_fails(tmp_path, capsys):
     report = found(shards(tmp_path / "s", broken=True), capsys, code=1)
     assert "does not match its checksum" in report["problems"][0]
+
+
+@pytest.mark.parametrize("name", ["../train-00000.tar", "..", "", "sub/train-00000.tar", "/dev/zero"])
+def test_an_index_cannot_name_files_outside_its_folder(tmp_path, capsys, name):
+    root = shards(tmp_path / "s")
+    (tmp_path / "train-00000.tar").write_bytes((root / "train-00000.tar").read_bytes())
+    index = json.loads((root / "index.json").read_text())
+    index["shards"][0]["file"] = name
+    (root / "index.json").write_text(json.dumps(index))
+    report = found(root, capsys, code=1)
+    assert "which is no file of its folder" in report["problems"][0]
+    assert report["splits"]["train"]["buffers"] == {}
+
+
+@pytest.mark.parametrize("change", [{"size": 10**13}, {"offset": -5}, {"offset": 10**13}])
+def test_a_place_beyond_the_shard_is_refused_without_taking_memory(tmp_path, change):
+    root = shards(tmp_path / "s")
+    index = json.loads((root / "index.json").read_text())
+    index["shards"][0]["samples"][0] |= change
+    (root / "index.json").write_text(json.dumps(index))
+    with contextlib.suppress(ValueError):
+        call(root)
+
+
+def test_names_inside_a_tar_are_never_paths(tmp_path, capsys):
+    root = shards(tmp_path / "s")
+    with tarfile.open(root / "train-00000.tar") as tar:
+        members = [(m.name, tar.extractfile(m).read()) for m in tar.getmembers()]
+    index = json.loads((root / "index.json").read_text())
+    with tarfile.open(root / "train-00000.tar", "w") as tar:
+        for name, data in members:
+            entry = tarfile.TarInfo("../../" + name)
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+    shard = index["shards"][0]
+    path = root / "train-00000.tar"
+    shard["bytes"], shard["sha256"] = path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+    (root / "index.json").write_text(json.dumps(index))
+    before = sorted(p for p in tmp_path.rglob("*"))
+    assert found(root, capsys)["splits"]["train"]["buffers"]
+    assert sorted(p for p in tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"format": "other"}', '{"format": "penumbra-shards"}'])
