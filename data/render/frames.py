@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -63,17 +63,38 @@ class Tracing(Protocol):
         ...
 
 
-def noisy_frames(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> list[Frame]:
+Report = Callable[[int], None]
+"""Called with the number of samples traced since the last call."""
+
+
+def ignored(count: int) -> None:
+    """Report nothing."""
+
+
+def reported(chunks: Iterator[Any], report: Report) -> Iterator[Any]:
+    """Yield chunks and report their samples."""
+    for chunk in chunks:
+        samples, rows, columns, _ = next(iter(chunk.values.values())).shape
+        report(samples * rows * columns)
+        yield chunk
+
+
+def noisy_frames(
+    tracer: Tracing, view: int, recipe: Recipe, seed: int, report: Report = ignored
+) -> Iterator[Frame]:
     """Render the noisy side of a view: a frame per number of samples, without reference and exposure.
+
+    Only one frame is held at a time, since a large image at many counts would fill the memory.
 
     Args:
         tracer: Of the scene.
         view: Number of the view.
         recipe: What to store.
         seed: Of the samples.
+        report: Told what was traced.
     """
     spec = tracer.spec
-    chunks = tracer.trace(
+    traced = tracer.trace(
         view,
         recipe.spp[-1],
         seed,
@@ -81,20 +102,20 @@ def noisy_frames(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> list[
         motion="shutter" if recipe.kind == "samples" else "previous",
         static=recipe.kind == "sequences",
     )
+    chunks = reported(traced, report)
     if recipe.kind == "samples":
         buffers, samples = _kept_apart(chunks, recipe)
         frame = _frame(tracer, view, view, recipe.spp[0], buffers)
         frame.samples = samples
-        return [frame]
-    frames = []
+        yield frame
+        return
     stream = ((chunk.rows, _with_specular(chunk.values)) for chunk in chunks)
     for level, (count, moments) in enumerate(at_counts(stream, recipe.spp, (recipe.height, recipe.width))):
         buffers = _still(moments) if recipe.kind == "stills" else _means(moments)
-        frames.append(_frame(tracer, view, view * len(recipe.spp) + level, count, buffers))
-    if len(recipe.spp) > 1 or not spec.path:
-        for frame in frames:
+        frame = _frame(tracer, view, view * len(recipe.spp) + level, count, buffers)
+        if len(recipe.spp) > 1 or not spec.path:
             frame.notes["view"] = view
-    return frames
+        yield frame
 
 
 def noisy_color(frame: Frame) -> Image:

@@ -85,7 +85,7 @@ def at_counts(
     Raises:
         ValueError: The stream ended before the last count was reached.
     """
-    height, width = size
+    (height, width), last = size, counts[-1]
     bands: dict[int, dict[str, Moments]] = {}
     finished: dict[int, dict[int, dict[str, Moments]]] = {count: {} for count in counts}
     for rows, values in chunks:
@@ -101,7 +101,9 @@ def at_counts(
                 moments.add(values[name][done : done + step])
             done += step
             if before + step in finished:
-                finished[before + step][rows.start] = {n: _copy(m) for n, m in band.items()}
+                # Nothing is added to the sums of the last count, so that they need no copy.
+                kept = band if before + step == last else {n: _copy(m) for n, m in band.items()}
+                finished[before + step][rows.start] = kept
         for count in counts:
             if sum(_rows(band) for band in finished[count].values()) == height:
                 yield count, _joined(finished.pop(count))

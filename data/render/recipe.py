@@ -83,9 +83,8 @@ class Recipe:
         """
         if self.kind not in get_args(Kind):
             raise ValueError(f"recipe {self.kind!r}: expected one of {', '.join(get_args(Kind))}")
-        for name in ("width", "height"):
-            if getattr(self, name) < 16:
-                raise ValueError(f"--{name} {getattr(self, name)}: expected at least 16 pixels")
+        if min(self.width, self.height) < 16:
+            raise ValueError(f"--size {self.width}x{self.height}: expected at least 16x16 pixels")
         if not self.spp or list(self.spp) != sorted(set(self.spp)) or self.spp[0] < 1:
             raise ValueError(f"--spp {' '.join(map(str, self.spp))}: expected ascending positive numbers")
         if self.kind == "stills" and any(n % 2 for n in self.spp):
@@ -95,8 +94,10 @@ class Recipe:
             raise ValueError(f"--spp: {self.kind} take one number")
         if self.reference_spp < 2:
             raise ValueError(f"--reference-spp {self.reference_spp}: expected at least 2")
-        if self.max_depth < 1 or self.chunk < 1024:
-            raise ValueError(f"--max-depth {self.max_depth}, chunk {self.chunk}: expected >= 1 and >= 1024")
+        if self.max_depth < 2:
+            raise ValueError(f"--max-depth {self.max_depth}: expected at least 2, which is direct light")
+        if self.chunk < 1024:
+            raise ValueError(f"chunk {self.chunk}: expected at least 1024 samples")
 
     @property
     def pixels(self) -> int:

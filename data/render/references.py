@@ -16,6 +16,9 @@ ENERGY_LIMIT = 4.0
 """Standard errors beyond which the mean of a noisy frame counts as different from that of its reference: one
 frame in 5000 with three channels of normal noise."""
 
+ROUNDING = 2.0**-11
+"""Relative error of a number that was stored in half precision: what is compared comes from a file."""
+
 RELATIVE_FLOOR = 1e-4
 """Added to the squared reference where its relative error is estimated, as in the metric `relmse_layer`."""
 
@@ -112,7 +115,8 @@ def energy_z(noisy: Image, spp: int, reference: Reference) -> float:
 
     Both are means of independent samples of the same pixels, so that
     `z = (mean(noisy) - mean(reference)) / sqrt(sum(variance) (1 / spp + 1 / n)) * pixels`, with the variance
-    of single samples taken from the reference. The channel with the largest magnitude is returned.
+    of single samples taken from the reference. What rounding to half precision can explain is taken off the
+    difference first. The channel with the largest magnitude is returned, at most 999.
 
     Args:
         noisy: Mean radiance (H, W, 3) of `spp` samples per pixel.
@@ -121,7 +125,9 @@ def energy_z(noisy: Image, spp: int, reference: Reference) -> float:
     """
     pixels = noisy.shape[0] * noisy.shape[1]
     difference = noisy.mean((0, 1), dtype=np.float64) - reference.radiance().mean((0, 1), dtype=np.float64)
+    rounding = ROUNDING * np.abs(noisy).mean((0, 1), dtype=np.float64)
+    difference = np.sign(difference) * np.maximum(np.abs(difference) - rounding, 0)
     variance = reference.sample_variance().sum((0, 1)) * (1 / spp + 1 / reference.count)
     error = np.sqrt(variance) / pixels
     z = np.where(error > 0, difference / np.where(error > 0, error, 1), np.where(difference == 0, 0, np.inf))
-    return float(z[np.abs(z).argmax()])
+    return float(np.clip(z[np.abs(z).argmax()], -999, 999))

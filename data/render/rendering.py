@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import queue
-import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data.ingestion import remove_set
-from data.manifest import MANIFEST, FrameRecord, Manifest, SceneRecord, load_manifest, make_splits, write_json
+from data.manifest import MANIFEST, FrameRecord, Manifest, SceneRecord, make_splits, write_json
+from data.render.output import bytes_of, check_room, examine, prepare
+from data.render.pool import measure_speed, tasks_of, work_on
 from data.render.recipe import Recipe, view_key
 from data.render.sources import Source
-from data.render.variant import Variant, activate
+from data.render.variant import Variant
 from data.render.views import WORK, ViewWork
-from data.render.worker import Task, render_task, speed_of, start
+
+__all__ = ["Plan", "RenderOptions", "bytes_of", "measure_speed", "plan", "remembered_speed", "render"]
 
 SPEED = "speed.json"
-JOB = "job.json"
 
 Progress = Callable[[int, int, str], None]
 
@@ -39,7 +34,7 @@ class RenderOptions:
         threads: Threads of each.
         test: Names of scenes held out for test; None: every eighth, the last of fewer.
         validation: Names of scenes held out for validation.
-        force: Replace another data set in the output.
+        force: Replace frames of another recipe or other scenes in the output.
     """
 
     variant: Variant
@@ -56,37 +51,31 @@ class Plan:
 
     Attributes:
         works: Views of every scene, in order.
+        unfinished: Those of them that are not finished; scenes without any are left out.
         samples: Samples that are needed in all.
         missing: Samples that are not there yet.
     """
 
     works: dict[str, list[ViewWork]]
+    unfinished: dict[str, list[ViewWork]]
     samples: int
     missing: int
 
 
-def plan(sources: Sequence[Source], recipe: Recipe, root: Path) -> Plan:
-    """Find out what is missing of a data set.
+def plan(sources: Sequence[Source], recipe: Recipe, root: Path, options: RenderOptions) -> Plan:
+    """Find out what is missing of a data set, and whether it can be rendered into a folder; changes nothing.
+
+    Every finished frame is read once, to see whether it is what it was.
 
     Raises:
-        ValueError: There are no scenes, or two have the same name.
+        ValueError: There are no scenes, two are the same or have the same name, a name to hold out is no
+            scene, or the folder holds something else.
+        OSError: The folder is a file.
     """
-    if not sources:
-        raise ValueError("nothing to render: give --random N or --scene FILE")
-    names = [source.name for source in sources]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"two scenes are called {twice[0]!r}; a file's name must be unique")
-    works, missing = {}, 0
-    for source in sources:
-        identity = source.identity()
-        works[source.name] = [
-            ViewWork(root, source.name, view, view_key(identity, view, recipe), recipe)
-            for view in range(source.shot.frames)
-        ]
-        missing += sum(_missing(work) for work in works[source.name])
-    total = recipe.samples_per_view() * sum(map(len, works.values()))
-    return Plan(works, total, missing)
+    works = _works(sources, recipe, root)
+    _splits(list(works), options)
+    examine(root, recipe, works, options.force)
+    return _plan(works, recipe)
 
 
 def render(
@@ -113,38 +102,18 @@ def render(
         OSError: The output cannot be written, or the disk has too little room.
     """
     root = Path(output)
-    plan(sources, recipe, root)  # what is wrong with the scenes is said before anything is touched
-    splits = _splits([source.name for source in sources], options)
-    _prepare_output(root, recipe, options.force)
-    todo = plan(sources, recipe, root)
-    _refuse_replacing(todo, root, options.force)
+    works = _works(sources, recipe, root)
+    splits = _splits(list(works), options)
+    prepare(root, recipe, examine(root, recipe, works, options.force))
+    todo = _plan(works, recipe)
     if todo.missing:
-        check_room(root, recipe, todo)
+        views = sum(map(len, works.values()))
+        check_room(root, int(bytes_of(recipe, views) * todo.missing / todo.samples))
         (root / MANIFEST).unlink(missing_ok=True)
-        _work(sources, todo, options, progress)
+        _work(sources, todo, root, options, progress)
     manifest = _manifest(sources, todo, recipe, splits, options, root)
     manifest.save(root)
     return manifest
-
-
-def bytes_of(recipe: Recipe, views: int) -> int:
-    """Return about how many bytes a data set takes: channels times two or four bytes, less what ZIP saves."""
-    channels = {"stills": 90, "sequences": 26, "samples": 20 * recipe.spp[0] + 14}[recipe.kind]
-    frames = len(recipe.spp) if recipe.kind == "stills" else 1
-    sums = 9 * 8
-    return int(views * recipe.pixels * (channels * 2.0 * frames + sums))
-
-
-def check_room(root: Path, recipe: Recipe, todo: Plan) -> None:
-    """Raise an OSError if what is missing would not fit on the disk."""
-    views = sum(map(len, todo.works.values()))
-    need = int(bytes_of(recipe, views) * todo.missing / max(todo.samples, 1))
-    free = shutil.disk_usage(root).free
-    if need > free:
-        raise OSError(
-            f"{root}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; choose another "
-            "--output, fewer scenes or a smaller size"
-        )
 
 
 def remembered_speed(root: Path) -> float | None:
@@ -155,17 +124,35 @@ def remembered_speed(root: Path) -> float | None:
         return None
 
 
-def measure_speed(source: Source, recipe: Recipe, variant: Variant, threads: int) -> float:
-    """Return the samples per second of one process on a scene, after what it takes to load the scene.
+def _works(sources: Sequence[Source], recipe: Recipe, root: Path) -> dict[str, list[ViewWork]]:
+    """Return the views of every scene."""
+    if not sources:
+        raise ValueError("nothing to render: give --random N or --scene FILE")
+    works: dict[str, list[ViewWork]] = {}
+    keys: dict[str, str] = {}
+    for source in sources:
+        name, identity = source.name, source.identity()
+        if name in works:
+            raise ValueError(f"two scenes are called {name!r}; a file's name must be unique")
+        works[name] = [
+            ViewWork(root, name, view, view_key(identity, view, recipe), recipe)
+            for view in range(source.shot.frames)
+        ]
+        same = keys.setdefault(works[name][0].key, name)
+        if same != name:
+            raise ValueError(f"scenes {same!r} and {name!r} have the same content; leave one of them out")
+    return works
 
-    Raises:
-        ValueError: The scene cannot be rendered.
-    """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        1, mp_context=context, initializer=activate, initargs=(variant, threads)
-    ) as pool:
-        return pool.submit(speed_of, source, recipe).result()
+
+def _plan(works: dict[str, list[ViewWork]], recipe: Recipe) -> Plan:
+    counts = {name: [(work, _missing(work)) for work in scene] for name, scene in works.items()}
+    unfinished = {name: [work for work, count in scene if count] for name, scene in counts.items()}
+    return Plan(
+        works,
+        {name: scene for name, scene in unfinished.items() if scene},
+        recipe.samples_per_view() * sum(map(len, works.values())),
+        sum(count for scene in counts.values() for _, count in scene),
+    )
 
 
 def _missing(work: ViewWork) -> int:
@@ -183,135 +170,23 @@ def _splits(names: list[str], options: RenderOptions) -> dict[str, list[str]]:
     return make_splits(names, test, options.validation)
 
 
-def _prepare_output(root: Path, recipe: Recipe, force: bool) -> None:
-    """Make the output ready: go on with the same work, refuse anything else unless forced."""
-    if root.exists() and not root.is_dir():
-        raise OSError(f"{root} is a file; --output must name a folder")
-    known = _known_recipe(root)
-    if known is not None and not recipe.same_work(known):
-        if not force:
-            raise ValueError(
-                f"{root} holds frames of another recipe ({_difference(recipe, known)}); --force replaces "
-                "them, or choose another --output"
-            )
-        if (root / MANIFEST).is_file():
-            remove_set(root)
-        shutil.rmtree(root / WORK, ignore_errors=True)
-    elif known is None and root.is_dir() and any(root.iterdir()):
-        if not (force and (root / MANIFEST).is_file()):
-            raise ValueError(f"{root} is not empty and was not rendered; choose an empty or new --output")
-        remove_set(root)
-    try:
-        (root / WORK).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(f"cannot write to {root}: {error.strerror}; choose another --output") from error
-    write_json(root / WORK / JOB, recipe.to_json())
-
-
-def _refuse_replacing(todo: Plan, root: Path, force: bool) -> None:
-    """Refuse to render a scene over one of the same name that was made from something else."""
-    planned = {work.key for works in todo.works.values() for work in works}
-    for path in sorted((root / WORK / "views").glob("*.json")):
-        scene = json.loads(path.read_text(encoding="utf-8")).get("scene")
-        if path.stem in planned or scene not in todo.works:
-            continue
-        if not force:
-            raise ValueError(
-                f"{root} holds another scene {scene!r}: its file, camera, probabilities or number of frames "
-                "were different; --force replaces it, or choose another --output"
-            )
-        path.unlink()
-        path.with_suffix(".npz").unlink(missing_ok=True)
-
-
-def _known_recipe(root: Path) -> dict[str, Any] | None:
-    try:
-        values = json.loads((root / WORK / JOB).read_text(encoding="utf-8"))
-        return values if isinstance(values, dict) else None
-    except (OSError, ValueError):
-        pass
-    try:
-        return load_manifest(root).recipe.get("recipe")
-    except (OSError, ValueError):
-        return None
-
-
-def _difference(recipe: Recipe, known: dict[str, Any]) -> str:
-    mine = recipe.to_json()
-    names = [n for n in mine if n != "reference_spp" and mine[n] != known.get(n)]
-    return ", ".join(f"{n} {known.get(n)} instead of {mine[n]}" for n in names)
-
-
-def _work(sources: Sequence[Source], todo: Plan, options: RenderOptions, progress: Progress | None) -> None:
-    """Run the tasks and report what they have done."""
-    tasks = list(_tasks(sources, todo, options.processes))
+def _work(
+    sources: Sequence[Source], todo: Plan, root: Path, options: RenderOptions, progress: Progress | None
+) -> None:
+    """Render what is missing, report it, and remember how fast it was."""
+    busy = [(source, todo.unfinished[source.name]) for source in sources if source.name in todo.unfinished]
+    tasks = list(tasks_of(busy, options.processes))
     done, began = todo.samples - todo.missing, time.monotonic()
-    context = multiprocessing.get_context("spawn")  # the renderer keeps threads, which no fork survives
-    reports = context.Queue()
-    pool = ProcessPoolExecutor(
-        min(options.processes, len(tasks)),
-        mp_context=context,
-        initializer=start,
-        initargs=(options.variant, options.threads, reports, os.getpid()),
-    )
-    try:
-        pending = [pool.submit(render_task, task) for task in tasks]
-        for count, label in _reports(reports, pending):
-            done += count
-            if progress is not None:
-                progress(done, todo.samples, label)
-        pool.shutdown()
-    except BaseException:
-        _end(pool)
-        raise
+
+    def report(count: int, label: str) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(min(done, todo.samples), todo.samples, label)
+
+    work_on(tasks, options.processes, options.variant, options.threads, report)
     seconds = max(time.monotonic() - began, 1e-3)
-    if todo.missing:
-        root = next(iter(todo.works.values()))[0].root
-        write_json(root / WORK / SPEED, {"samples_per_second": todo.missing / seconds})
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    """Stop the processes of a pool without waiting for the passes that they are at."""
-    processes = list((pool._processes or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
-    for process in processes:
-        process.terminate()
-
-
-def _reports(reports: Any, pending: list[Future[None]]) -> Iterator[tuple[int, str]]:
-    """Yield what the processes report until all tasks are done; raises the first error of a task."""
-    left = set(pending)
-    while left:
-        try:
-            yield reports.get(timeout=0.2)
-            continue
-        except queue.Empty:
-            pass
-        for future in [f for f in left if f.done()]:
-            left.remove(future)
-            try:
-                future.result()
-            except BrokenProcessPool:
-                raise ValueError(
-                    "a rendering process died (out of memory, or the renderer aborted); finished work is "
-                    "kept: run the same command again, with fewer --processes or --variant scalar"
-                ) from None
-    while True:
-        try:
-            yield reports.get_nowait()
-        except queue.Empty:
-            return
-
-
-def _tasks(sources: Sequence[Source], todo: Plan, processes: int) -> Iterator[Task]:
-    """Yield tasks: whole scenes where there are enough, so that each is loaded once; else parts of them."""
-    busy = [(s, [w for w in todo.works[s.name] if _missing(w)]) for s in sources]
-    busy = [(source, works) for source, works in busy if works]
-    parts = -(-processes // max(len(busy), 1))
-    for source, works in busy:
-        count = min(parts, len(works))
-        for part in range(count):
-            yield Task(source, works[part * len(works) // count : (part + 1) * len(works) // count])
+    write_json(root / WORK / SPEED, {"samples_per_second": todo.missing / seconds})
 
 
 def _manifest(
@@ -324,7 +199,7 @@ def _manifest(
 ) -> Manifest:
     scenes = {}
     for source in sources:
-        memories = [work.remembered() for work in todo.works[source.name]]
+        memories = [work.remembered(unaltered=False) for work in todo.works[source.name]]
         lost = next((w for w, m in zip(todo.works[source.name], memories, strict=True) if m is None), None)
         if lost is not None:
             raise ValueError(
@@ -333,13 +208,14 @@ def _manifest(
         known: list[dict[str, Any]] = [m for m in memories if m is not None]
         records: list[FrameRecord] = [record for memory in known for record in memory["records"]]
         counts = sorted({m["reference_spp"] for m in known})
+        renderers = " and ".join(dict.fromkeys(m["renderer"] for m in known))
         spp = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         scenes[source.name] = SceneRecord(
             frames=tuple(sorted(records, key=lambda r: r.index)),
             sequence=bool(known[0]["path"]),
             credit=known[0]["credit"],
             license=known[0]["license"],
-            provenance=f"{known[0]['renderer']}, path traced to depth {recipe.max_depth}, box filter, "
+            provenance=f"{renderers}, path traced to depth {recipe.max_depth}, box filter, "
             f"reference {spp} spp",
             origin=known[0]["origin"],
         )

@@ -9,6 +9,12 @@ from pathlib import Path
 from typing import Any
 
 
+def scene_name(path: Path) -> str:
+    """Return the name of a scene's file; that of its folder where the file is called scene.xml."""
+    resolved = path.resolve()
+    return resolved.parent.name if resolved.stem == "scene" else resolved.stem
+
+
 def scene_files(path: Path) -> dict[str, str]:
     """Return every file that a scene is made of, as its text names it → SHA-256.
 
@@ -31,8 +37,12 @@ def scene_files_hash(path: Path) -> str:
     return hashlib.sha256(parts.encode()).hexdigest()
 
 
-def _references(path: Path, name: str, root: Path) -> Iterator[tuple[str, Path]]:
-    """Yield a file and, if it is XML, what it refers to."""
+def _references(
+    path: Path, name: str, root: Path, within: tuple[Path, ...] = ()
+) -> Iterator[tuple[str, Path]]:
+    """Yield a file and, if it is XML, what it refers to; `within`: the files that include it."""
+    if path in within:
+        raise ValueError(f"scene {within[0]}: {name} includes itself; remove that <include>")
     yield name, path
     if path.suffix.lower() != ".xml" or not path.is_file():
         return
@@ -45,7 +55,7 @@ def _references(path: Path, name: str, root: Path) -> Iterator[tuple[str, Path]]
         if value is not None:
             for variable in sorted(defaults, key=len, reverse=True):
                 value = value.replace(f"${variable}", defaults[variable])
-            yield from _references(root / value, value, root)
+            yield from _references(root / value, value, root, (*within, path))
 
 
 def _xml(path: Path) -> Any:

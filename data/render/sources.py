@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from data.render.assets import Assets
 from data.render.random_scenes import GENERATOR_VERSION, Kind, random_scene
+from data.render.scene_files import scene_files_hash, scene_name
 from data.render.spec import SceneSpec, Shot
 
 if TYPE_CHECKING:
@@ -88,17 +89,15 @@ class FileSource:
     @property
     def name(self) -> str:
         """Name of the file; that of its folder where the file is called scene.xml."""
-        resolved = self.path.resolve()
-        return resolved.parent.name if resolved.stem == "scene" else resolved.stem
+        return scene_name(self.path)
 
     def identity(self) -> dict[str, Any]:
         """Return the hash of the file and of those it refers to, shot, move and seed."""
-        from data.render.user_scenes import scene_files_hash
-
         return {
             "files": scene_files_hash(self.path),
             "shot": asdict(self.shot),
-            "move": asdict(self.move),
+            # Where the key frames lie does not matter: their digest is part of the move.
+            "move": {name: value for name, value in asdict(self.move).items() if name != "path"},
             "seed": self.seed,
         }
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from data.render.camera_paths import Jitter, jittered, keyframed, orbit
 from data.render.loading import load_file
-from data.render.scene_files import declared_sensors, scene_files, scene_files_hash
+from data.render.scene_files import declared_sensors, scene_files, scene_files_hash, scene_name
 from data.render.spec import SceneSpec, Shot, View
 from data.render.tracer import Tracer
 
@@ -82,7 +82,7 @@ def user_scene(path: Path, shot: Shot, move: CameraMove, seed: int) -> SceneSpec
     original = _file_view(path, shot)
     credit, terms = _terms(path)
     spec = SceneSpec(
-        name=_name(path),
+        name=scene_name(path),
         content=path,
         views=(original,),
         path=move.kind in ("orbit", "keyframes") or (move.kind == "fixed" and shot.path),
@@ -98,12 +98,6 @@ def user_scene(path: Path, shot: Shot, move: CameraMove, seed: int) -> SceneSpec
         license=terms,
     )
     return replace(spec, views=_views(spec, shot, move, np.random.default_rng(seed)))
-
-
-def _name(path: Path) -> str:
-    """Return the name of the file; that of its folder where the file is called scene.xml."""
-    resolved = path.resolve()
-    return resolved.parent.name if resolved.stem == "scene" else resolved.stem
 
 
 def _terms(path: Path) -> tuple[str, str]:

@@ -8,7 +8,6 @@ meet work that does not fit them.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,13 @@ from data.exr import read_frame
 from data.frame import Frame
 from data.ingestion import write_record
 from data.manifest import FrameRecord, file_sha256, write_json
-from data.render.frames import Tracing, noisy_color, noisy_frames
+from data.render.frames import Report, Tracing, ignored, noisy_color, noisy_frames, reported
 from data.render.recipe import Recipe, seed_of
 from data.render.references import Reference, energy_z
 from data.render.spec import SceneSpec
 
 WORK = ".render"
 """Folder inside a rendered data set that remembers finished work and the sums of the references."""
-
-Report = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -57,23 +54,24 @@ class ViewWork:
         """File with the sums of the reference."""
         return self.root / WORK / "references" / f"{self.key}.npz"
 
-    def remembered(self) -> dict[str, Any] | None:
-        """Return the memory, None where there is none or its files were altered."""
+    def remembered(self, unaltered: bool = True) -> dict[str, Any] | None:
+        """Return the memory, None where there is none or a file of it is gone.
+
+        Args:
+            unaltered: Read the files, and return None where one is not what it was when it was written.
+        """
         try:
             memory = json.loads(self.memory.read_text(encoding="utf-8"))
             records = [FrameRecord(**record) for record in memory["records"]]
             for record in records:
                 path = self.root / record.file
-                if path.stat().st_size != record.bytes or file_sha256(path) != record.sha256:
+                if path.stat().st_size != record.bytes:
+                    return None
+                if unaltered and file_sha256(path) != record.sha256:
                     return None
         except (OSError, ValueError, TypeError, KeyError):
             return None
         return {**memory, "records": records}
-
-    def reference_spp_done(self) -> int:
-        """Return the samples per pixel of the reference in the finished files, 0 where there are none."""
-        memory = self.remembered()
-        return 0 if memory is None else int(memory["reference_spp"])
 
 
 def render_view(work: ViewWork, tracer: Tracing, renderer: str, report: Report) -> None:
@@ -92,22 +90,19 @@ def render_view(work: ViewWork, tracer: Tracing, renderer: str, report: Report) 
     memory = work.remembered()
     recipe = work.recipe
     if memory is None:
-        frames = noisy_frames(tracer, work.view, recipe, seed_of(work.key, "input"))
+        frames = noisy_frames(tracer, work.view, recipe, seed_of(work.key, "input"), report)
         records = [_write(work, frame) for frame in frames]
         memory = _remember(work, tracer.spec, renderer, records, 0)
-        report(recipe.pixels * recipe.spp[-1])
     reference = Reference.load(work.sums, recipe.height, recipe.width, recipe.kind == "stills")
     while reference.count < recipe.reference_spp:
-        before = reference.count
-        add_pass(reference, tracer, work)
+        add_pass(reference, tracer, work, report)
         reference.save(work.sums)
-        report(recipe.pixels * (reference.count - before))
     if memory["reference_spp"] != reference.count:
         records = [_finished(work, record, reference) for record in memory["records"]]
         _remember(work, tracer.spec, renderer, records, reference.count)
 
 
-def add_pass(reference: Reference, tracer: Tracing, work: ViewWork) -> None:
+def add_pass(reference: Reference, tracer: Tracing, work: ViewWork, report: Report = ignored) -> None:
     """Render one pass, or what is missing where that is less, and add it to a reference.
 
     Its seed follows from the samples before it, so that a reference refined in steps of whole passes equals
@@ -117,7 +112,8 @@ def add_pass(reference: Reference, tracer: Tracing, work: ViewWork) -> None:
     seed = seed_of(work.key, "reference", reference.count)
     static = work.recipe.kind == "sequences"
     before = tracer.invalid
-    for chunk in tracer.trace(work.view, spp, seed, work.recipe.reference_names, static=static):
+    chunks = tracer.trace(work.view, spp, seed, work.recipe.reference_names, static=static)
+    for chunk in reported(chunks, report):
         reference.add(chunk.rows, *(chunk.values[name] for name in work.recipe.reference_names))
     reference.invalid += tracer.invalid - before
     reference.passes += 1

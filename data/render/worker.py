@@ -48,19 +48,34 @@ def render_task(task: Task) -> None:
         OSError: A file cannot be written.
     """
     _report(0, f"{task.source.name}: preparing")
-    spec = task.source.build()
     recipe = task.works[0].recipe
     try:
+        spec = task.source.build()
         tracer = Tracer(spec, chunk=recipe.chunk, max_depth=recipe.max_depth)
         for work in task.works:
             label = f"{work.scene}, view {work.view}"
             render_view(work, tracer, _Process.renderer, partial(_report, label=label))
     except RuntimeError as error:
-        raise ValueError(f"scene {spec.name!r}: the renderer failed: {error}") from error
+        raise _failed(task.source, error) from error
 
 
 def speed_of(source: Source, recipe: Recipe) -> float:
-    """Return the samples per second of a reference, measured on the second pass; the first one compiles."""
+    """Return the samples per second of a reference, measured on the second pass; the first one compiles.
+
+    Raises:
+        ValueError: The scene cannot be made or rendered; the message names it.
+    """
+    try:
+        return _speed(source, recipe)
+    except RuntimeError as error:
+        raise _failed(source, error) from error
+
+
+def _failed(source: Source, error: RuntimeError) -> ValueError:
+    return ValueError(f"scene {source.name!r}: the renderer failed: {' '.join(str(error).split())[:600]}")
+
+
+def _speed(source: Source, recipe: Recipe) -> float:
     tracer = Tracer(source.build(), chunk=recipe.chunk, max_depth=recipe.max_depth)
     spp = max(1, min(recipe.reference_spp, recipe.chunk // recipe.pixels))
     seconds = 0.0

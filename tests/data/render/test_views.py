@@ -6,6 +6,7 @@ import pytest
 from data.derive import derive
 from data.exr import read_frame
 from data.manifest import FrameRecord
+from data.render.frames import noisy_frames
 from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
 from data.render.references import Reference, energy_z
 from data.render.views import ViewWork, add_pass, render_view
@@ -91,7 +92,9 @@ def test_more_reference_samples_are_added_to_what_is_there(tmp_path):
     tracer = FakeTracer()
     finer = with_options(STILLS, reference_spp=96)
     done = work(tmp_path, finer)
-    assert render(done, tracer) == [finer.pixels * 32]
+    counts = render(done, tracer)
+    assert sum(counts) == finer.pixels * 32
+    assert max(counts) < sum(counts), "a pass may take minutes: it is reported in parts"
     assert [spp for _, spp, _ in tracer.calls] == [32]
     assert records(done)[0].reference_spp == 96
 
@@ -159,6 +162,27 @@ def test_energy_of_equal_means_is_within_three_errors_and_of_brighter_input_is_n
     assert energy_z(noisy(1.3, 1), 4, reference) > 5
 
 
+def test_rounding_of_stored_radiance_is_no_difference_of_energy():
+    constant = np.full((16, 24, 3), 0.8003, np.float32)
+    reference = Reference.empty(16, 24)
+    reference.add(slice(0, 16), np.repeat(constant[None], 64, 0))
+    reference.count = 64
+    stored = constant.astype(np.float16).astype(np.float32)
+    assert not np.array_equal(stored, constant)
+    assert energy_z(stored, 4, reference) == 0
+    assert energy_z(stored * np.float32(1.01), 4, reference) == 999
+
+
+def test_frames_of_a_view_are_made_one_after_the_other():
+    tracer = FakeTracer(chunk=24 * 16 * 2)
+    counts = []
+    frames = noisy_frames(tracer, 0, STILLS, 1, counts.append)
+    assert next(frames).spp == 2
+    assert sum(counts) == 24 * 16 * 2
+    assert [frame.spp for frame in frames] == [4]
+    assert sum(counts) == 24 * 16 * 4
+
+
 def test_standard_errors_of_the_energy_have_unit_spread():
     reference = Reference.empty(16, 24)
     add_pass(reference, FakeTracer(), work(None, Recipe("samples", 24, 16, (4,), 256)))
@@ -188,7 +212,8 @@ def test_keys_depend_on_scene_view_and_recipe_but_not_on_the_reference_samples()
         ({"spp": (3,)}, "must be even"),
         ({"spp": (4, 2)}, "ascending"),
         ({"reference_spp": 1}, "at least 2"),
-        ({"width": 8}, "at least 16"),
+        ({"width": 8}, "--size 8x256: expected at least 16x16"),
+        ({"max_depth": 1}, "--max-depth 1: expected at least 2"),
     ],
 )
 def test_recipes_that_make_no_sense_are_refused(options, message):
