@@ -23,15 +23,16 @@ class SampleRate:
         self._start: tuple[float, int] | None = None
 
     def text(self, done: int, total: int) -> str:
-        """Return `12.3/80.0 M samples, 0.35 M/s, 3:13 left`."""
+        """Return `12.3/80.0 M samples, 0.35 M/s, 3:13 left`; small amounts in thousands."""
         now = time.monotonic()
         if self._start is None:
             self._start = (now, done)
         begun, before = self._start
         rate = (done - before) / (now - begun) if now > begun else 0.0
-        text = f"{done / 1e6:.1f}/{total / 1e6:.1f} M samples"
+        unit, letter = (1e6, "M") if total >= 1e6 else (1e3, "k")
+        text = f"{done / unit:.1f}/{total / unit:.1f} {letter} samples"
         if rate > 0:
-            text += f", {rate / 1e6:.3g} M/s"
+            text += f", {rate / unit:.2g} {letter}/s"
             if done < total:
                 text += f", {duration((total - done) / rate)} left"
         return text

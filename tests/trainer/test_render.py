@@ -16,6 +16,8 @@ from data.camera import motion
 from data.frames import FrameSet
 from data.render.references import ENERGY_LIMIT
 from trainer.cli import main
+from trainer.commands.render import _resumable
+from trainer.progress import SampleRate
 
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective">
@@ -141,17 +143,61 @@ def test_a_dry_run_says_what_would_be_rendered_and_writes_nothing(scene, tmp_pat
     [
         ([], "give --random N or --scene FILE"),
         (["--random", "1", "--size", "24"], "columns x rows"),
+        (["--random", "1", "--size", "0x5"], "--size 0x5: expected at least 16x16"),
         (["--random", "1", "--spp", "3"], "must be even"),
         (["--random", "1", "--defocus", "2"], "from 0 to 1"),
         (["--random", "1", "--memory", "0.1"], "at least 0.5 GB"),
-        (["--scene", "missing.xml"], "missing.xml"),
+        (["--random", "1", "--max-depth", "1"], "--max-depth 1: expected at least 2"),
+        (["--random", "1", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["--random", "1", "--processes", "0"], "--processes 0: expected at least 1"),
+        (["--random", "1", "--camera", "fixed"], "--camera is for Mitsuba files"),
+        (["--scene", "a.xml", "--meshes", "."], "--meshes is for random scenes"),
     ],
 )
 def test_wrong_options_are_named_before_anything_is_rendered(tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
-    assert run(monkeypatch, ["render", "stills", "--output", "set", *options]) in (1, 2)
+    assert run(monkeypatch, ["render", "stills", "--output", "set", *options]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("stills", ["--scene", "missing.xml"], "missing.xml does not exist"),
+        ("stills", ["--random", "1", "--test", "sea"], "no scene 'sea' to hold out"),
+        ("stills", ["--random", "1", "--output", "file"], "file is a file"),
+        (
+            "stills",
+            ["--scene", "a.xml", "--camera", "orbt"],
+            "--camera orbt: neither fixed, jitter, orbit nor",
+        ),
+        ("sequences", ["--scene", "a.xml", "--camera", "jitter"], "views that are no sequence"),
+    ],
+)
+def test_a_dry_run_finds_what_the_run_would_find(tmp_path, monkeypatch, capsys, kind, options, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert run(monkeypatch, ["render", kind, "--output", "set", *options, "--dry-run"]) in (1, 2)
+    assert message in capsys.readouterr().err
+
+
+def test_ended_by_a_batch_system_it_cleans_up_and_says_how_to_go_on(capsys):
+    def ended():
+        with _resumable():
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(60)
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit, match="143"):
+        ended()
+    assert "the same command goes on" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_progress_of_small_work_is_told_in_thousands():
+    assert SampleRate().text(1500, 4000).startswith("1.5/4.0 k samples")
+    assert SampleRate().text(1_500_000, 4_000_000).startswith("1.5/4.0 M samples")
 
 
 def test_a_broken_scene_is_one_line_with_the_file(scene, tmp_path, monkeypatch, capsys):

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from data.render.recipe import Recipe
+    from data.render.rendering import RenderOptions
     from data.render.sources import Source
-    from data.render.variant import Variant
 
 VARIANTS = {"auto": None, "llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
 
@@ -44,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     work.add_argument(
         "--dry-run", action="store_true", help="print what would be rendered, its size and time"
     )
-    work.add_argument("--force", action="store_true", help="replace frames of another recipe in DIR")
+    work.add_argument(
+        "--force", action="store_true", help="remove frames of another recipe or of other scenes from DIR"
+    )
 
 
 def _scene_arguments(group: Any) -> None:
@@ -54,8 +59,7 @@ def _scene_arguments(group: Any) -> None:
         "--places",
         nargs="+",
         choices=("outdoor", "indoor"),
-        default=("outdoor", "indoor"),
-        help="kinds, in turn",
+        help="kinds, in turn (default: both)",
     )
     for name, what in (("meshes", "OBJ, PLY, glTF"), ("textures", "PNG, JPEG"), ("environments", "EXR, HDR")):
         group.add_argument(f"--{name}", metavar="DIR", type=Path, help=f"your {name} to mix in ({what})")
@@ -64,7 +68,6 @@ def _scene_arguments(group: Any) -> None:
     )
     group.add_argument(
         "--camera",
-        default="auto",
         metavar="MOVE",
         help="of Mitsuba files: fixed, jitter, orbit, or a JSON file with key frames (default: orbit for "
         "sequences, jitter otherwise)",
@@ -96,7 +99,8 @@ def run(args: argparse.Namespace) -> int:
     """Render, or print what would be; returns 0, or 1 where a noisy mean is not that of its reference.
 
     Raises:
-        ValueError: Options that do not fit, Mitsuba is not installed, or a scene cannot be rendered.
+        UsageError: Options that do not fit.
+        ValueError: Mitsuba is not installed, or a scene cannot be rendered.
         OSError: The output cannot be written.
     """
     from data.render.rendering import RenderOptions, render
@@ -104,19 +108,17 @@ def run(args: argparse.Namespace) -> int:
     from trainer.configs import UsageError
     from trainer.progress import sample_progress
 
-    recipe = _recipe(args)
+    try:
+        _check(args)
+        recipe = _recipe(args)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
     sources = _sources(args, recipe)
-    if not sources:
-        raise UsageError("nothing to render: give --random N or --scene FILE")
     variant = choose(VARIANTS[args.variant])
     print(f"Mitsuba's variant: {variant.reason}", flush=True)
     cores = len(os.sched_getaffinity(0))
-    if args.processes is not None and args.processes < 1:
-        raise UsageError(f"--processes {args.processes}: expected at least 1")
     # Loading a scene and compiling its kernels use one core, so that more processes keep more cores busy.
     processes = args.processes or max(min(cores, 2), cores // 2)
-    if args.dry_run:
-        return _dry_run(args, recipe, sources, variant, processes)
     options = RenderOptions(
         variant,
         processes,
@@ -125,9 +127,53 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.validation),
         args.force,
     )
-    with sample_progress("rendering") as progress:
+    if args.dry_run:
+        return _dry_run(args.output, recipe, sources, options)
+    with _resumable(), sample_progress("rendering") as progress:
         manifest = render(sources, recipe, args.output, options, progress)
     return _summary(args.output, manifest)
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """Say that an interrupted command can go on, also where it is ended as batch systems do."""
+
+    def end(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        print("what is finished is kept: the same command goes on from there", file=sys.stderr, flush=True)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raise a ValueError where options do not fit each other or their range."""
+    if args.random < 0:
+        raise ValueError(f"--random {args.random}: expected a number of scenes, 0 or more")
+    if not args.random and not args.scene:
+        raise ValueError("nothing to render: give --random N or --scene FILE")
+    if args.seed < 0:
+        raise ValueError(f"--seed {args.seed}: expected 0 or more")
+    if args.frames is not None and args.frames < 1:
+        raise ValueError(f"--frames {args.frames}: expected at least 1")
+    if args.processes is not None and args.processes < 1:
+        raise ValueError(f"--processes {args.processes}: expected at least 1")
+    for name in ("defocus", "motion"):
+        value = getattr(args, name)
+        if value is not None and not 0 <= value <= 1:
+            raise ValueError(f"--{name} {value}: expected a probability from 0 to 1")
+    for name in ("places", "meshes", "textures", "environments", "defocus", "motion"):
+        if getattr(args, name) is not None and not args.random:
+            raise ValueError(f"--{name} is for random scenes: give --random N, or leave it out")
+    if args.camera is not None and not args.scene:
+        raise ValueError("--camera is for Mitsuba files: give --scene FILE, or leave it out")
+    if args.camera == "jitter" and args.kind == "sequences":
+        raise ValueError("--camera jitter gives views that are no sequence: fixed, orbit or a JSON file")
 
 
 def _recipe(args: argparse.Namespace) -> Recipe:
@@ -169,16 +215,11 @@ def _sources(args: argparse.Namespace, recipe: Recipe) -> list[Source]:
 
     path = args.kind == "sequences"
     moving = 0.0 if path else 0.5
-    frames = args.frames if args.frames is not None else (8 if path else 1)
-    for name, value in (("defocus", args.defocus), ("motion", args.motion)):
-        if value is not None and not 0 <= value <= 1:
-            raise ValueError(f"--{name} {value}: expected a probability from 0 to 1")
-    if frames < 1 or args.random < 0:
-        raise ValueError(f"--frames {frames}, --random {args.random}: expected at least 1 and 0")
+    places: Any = args.places or ("outdoor", "indoor")
     shot = Shot(
         recipe.width,
         recipe.height,
-        frames,
+        args.frames or (8 if path else 1),
         path,
         moving if args.defocus is None else args.defocus,
         moving if args.motion is None else args.motion,
@@ -186,8 +227,7 @@ def _sources(args: argparse.Namespace, recipe: Recipe) -> list[Source]:
     given = (args.meshes, args.textures, args.environments)
     assets = Assets.scan(*given) if any(given) else None
     random: list[Source] = [
-        RandomSource(args.seed + i, args.places[i % len(args.places)], shot, assets)
-        for i in range(args.random)
+        RandomSource(args.seed + i, places[i % len(places)], shot, assets) for i in range(args.random)
     ]
     files = [FileSource(path, shot, _camera(args), args.seed) for path in args.scene]
     return [*random, *files]
@@ -196,20 +236,18 @@ def _sources(args: argparse.Namespace, recipe: Recipe) -> list[Source]:
 def _camera(args: argparse.Namespace) -> Any:
     from data.render.user_scenes import CameraMove
 
-    kind = args.camera
-    if kind == "auto":
-        kind = "orbit" if args.kind == "sequences" else "jitter"
+    kind: Any = args.camera or ("orbit" if args.kind == "sequences" else "jitter")
     if kind in ("fixed", "jitter", "orbit"):
         return CameraMove(kind)
+    if not Path(kind).is_file():
+        raise ValueError(f"--camera {kind}: neither fixed, jitter, orbit nor a JSON file with key frames")
     return CameraMove("keyframes", path=Path(kind))
 
 
-def _dry_run(
-    args: argparse.Namespace, recipe: Recipe, sources: Sequence[Source], variant: Variant, processes: int
-) -> int:
-    from data.render.rendering import bytes_of, plan, remembered_speed
+def _dry_run(output: Path, recipe: Recipe, sources: Sequence[Source], options: RenderOptions) -> int:
+    from data.render.rendering import bytes_of, measure_speed, plan, remembered_speed
 
-    todo = plan(sources, recipe, args.output)
+    todo = plan(sources, recipe, output, options)
     views = sum(map(len, todo.works.values()))
     frames = views * len(recipe.spp)
     print(
@@ -224,21 +262,15 @@ def _dry_run(
     )
     if not todo.missing:
         return 0
-    speed, source = remembered_speed(args.output), "the last call"
+    speed, source = remembered_speed(output), "the last call"
     if speed is None:
         print(f"measuring the speed on {sources[0].name} …", flush=True)
-        speed, source = _measured(sources[0], recipe, variant, processes), "one scene"
+        one = measure_speed(sources[0], recipe, options.variant, options.threads)
+        speed, source = options.processes * one, "one scene"
     print(
         f"about {_duration(todo.missing / speed)} at {speed / 1e6:.2f} million samples per second ({source})"
     )
     return 0
-
-
-def _measured(source: Source, recipe: Recipe, variant: Variant, processes: int) -> float:
-    from data.render.rendering import measure_speed
-
-    threads = max(1, len(os.sched_getaffinity(0)) // processes)
-    return processes * measure_speed(source, recipe, variant, threads)
 
 
 def _duration(seconds: float) -> str:
