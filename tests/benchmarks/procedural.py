@@ -31,8 +31,8 @@ from trainer.runs import find_checkpoint
 FOLDER = Path("bench") / "procedural"
 SETS = {
     "stills": "--random 24 --seed 1001 --size 128x128 --spp 4 8 16 32 --reference-spp 128",
-    "sequences": "--random 5 --seed 2001 --frames 8 --size 256x144 --reference-spp 64 --test outdoor-002005",
-    "samples": "--random 8 --seed 3001 --size 96x96 --reference-spp 256",
+    "sequences": "--random 5 --seed 2001 --frames 8 --size 192x128 --reference-spp 64 --test outdoor-002005",
+    "samples": "--random 8 --seed 3001 --size 64x64 --reference-spp 256",
 }
 STEPS = 1080
 """Steps of `wskp_bmfr.yaml` on the sample."""
