@@ -21,6 +21,10 @@ EXPOSURE_KEY = 0.18
 """Grey that `automatic_exposure` maps the mean log luminance to."""
 
 
+_ROWS = 16
+"""Rows that are worked on at a time, so that double precision stays within the cache."""
+
+
 def effective_albedo(diffuse: Image, specular: Image | None = None) -> Image:
     """Return what radiance is divided by, (H, W, 3) in [0.01, 1].
 
@@ -243,8 +247,12 @@ class _Context:
         position, camera = self.frame.buffers.get("position"), self.frame.camera
         if position is None or camera is None:
             raise self._fail("depth", "position" if position is None else "the camera")
-        depth = cameras.depth(camera, np.ascontiguousarray(position), self.depth_kind)
-        depth = np.where(no_hit(self.frame), np.float32(0), np.maximum(depth, 0))
+        if self.depth_kind == "z":
+            depth = cameras.depth(camera, np.ascontiguousarray(position), "z")
+        else:
+            depth = _distance(position, camera.centre())
+        np.maximum(depth, 0, out=depth)
+        depth[no_hit(self.frame)] = 0
         rule = (
             "w of the projected position"
             if self.depth_kind == "z"
@@ -278,11 +286,28 @@ class _Context:
         return np.ones((self.frame.height, self.frame.width, 1), np.float32), "1, not accumulated"
 
 
+def _distance(position: Image, centre: NDArray[np.float64]) -> Image:
+    """Return `data.camera.depth` of kind euclidean, (H, W, 1), row by row so that it stays in the cache."""
+    height, width, _ = position.shape
+    result = np.empty((height, width, 1), np.float32)
+    part, total = np.empty((_ROWS, width)), np.empty((_ROWS, width))
+    for top in range(0, height, _ROWS):
+        rows = position[top : top + _ROWS]
+        offset, squares = part[: len(rows)], total[: len(rows)]
+        for axis in range(3):
+            np.subtract(rows[..., axis], centre[axis], out=offset)
+            np.multiply(offset, offset, out=squares if axis == 0 else offset)
+            if axis:
+                np.add(squares, offset, out=squares)
+        result[top : top + _ROWS, :, 0] = np.sqrt(squares, out=squares)
+    return result
+
+
 def no_hit(frame: Frame) -> NDArray[np.bool_]:
     """Return where nothing was hit (H, W, 1): position exactly 0, and so is the normal where there is one."""
     nothing = np.ones((frame.height, frame.width), bool)
     for name in ("position", "normal"):
-        if name in frame.buffers:
+        if name in frame.buffers and nothing.any():
             for channel in np.moveaxis(frame.buffers[name], -1, 0):
                 nothing &= channel == 0
     return nothing[..., None]

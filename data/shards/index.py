@@ -161,10 +161,26 @@ def write_json(path: Path, record: Any) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with temporary.open("w", encoding="utf-8") as file:
-            json.dump(record, file, indent=1, ensure_ascii=False, sort_keys=True)
-            file.write("\n")
+            file.write(_text(record))
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _text(record: Any) -> str:
+    """Return JSON with a line for each entry, and for each element of an entry that is a list.
+
+    Indenting all of it would take the encoder of the standard library a tenth of the time of cutting.
+    """
+
+    def line(value: Any) -> str:
+        return json.dumps(value, ensure_ascii=False, sort_keys=True)
+
+    def entry(value: Any) -> str:
+        return "[\n" + ",\n".join(map(line, value)) + "\n]" if isinstance(value, list) else line(value)
+
+    if not isinstance(record, dict):
+        return line(record) + "\n"
+    return "{\n" + ",\n".join(f"{line(key)}: {entry(record[key])}" for key in sorted(record)) + "\n}\n"
