@@ -1,3 +1,4 @@
+from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,12 +10,14 @@ from data.frame import Frame, Samples
 from data.frames import FrameSet
 from data.ingestion import write_record
 from data.manifest import Manifest, SceneRecord
+from data.shards.division import plan_shards
+from data.shards.options import RECIPES, recipe_options
 from tests.data.miniature import Crop, ingested, sample_crop
-from trainer.reports import data_report
+from trainer.reports import data_page, data_report
 from trainer.reports.data_page import column_frames, noise_rows, strip_frames
 from trainer.reports.data_report import examine, make_jobs, write_report
 from trainer.reports.findings import findings
-from trainer.reports.frame_facts import scores
+from trainer.reports.frame_facts import FrameJob, look_at, scores
 from trainer.reports.thumbnails import window
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "dataset" / "stills"
@@ -354,6 +357,79 @@ def test_the_motion_of_a_sequence_is_that_of_its_second_frame(tmp_path):
     _, text = report(root, tmp_path)
     assert "motion of frame 1" in Page(text).all("img", "alt")
     assert "hue: direction, up to 1.4 px" in text
+
+
+def test_motion_that_is_not_stored_is_derived_from_positions_and_cameras(tmp_path):
+    scene = "classroom"
+    pair = [sample_crop(scene, i) for i in (0, 1)]
+    for frame in pair:
+        frame.buffers.pop("motion", None)
+    root = made(tmp_path / "set", {scene: pair, "b": levels()}, classroom={"sequence": True})
+    frames = FrameSet(root)
+    second = frames.frames(scene)[1]
+    assert "motion" not in second.buffers
+    _, text = report(root, tmp_path)
+    assert f"motion of frame {second.index}" in Page(text).all("img", "alt")
+    last = list(frames.sequence(scene, ["motion"]))[1].buffers["motion"]
+    longest = np.percentile(np.hypot(last[..., 0], last[..., 1]), 99)
+    assert f"up to {longest:.2g} px" in text
+    stranger = FrameJob(str(root), scene, second, "main", 64, before="none.exr")
+    assert "motion" not in look_at(stranger).thumbnails
+
+
+def test_the_numbers_of_patches_are_those_that_prepare_plans(tmp_path):
+    frames = [
+        frame
+        for view in (0, 1, 2)
+        for frame in (
+            Frame(
+                {
+                    "color": np.ones((144, 160, 3), np.float32),
+                    "reference": np.ones((144, 160, 3), np.float32),
+                },
+                "a",
+                2 * view + level,
+                spp=spp,
+                exposure=1.0,
+                notes={"view": view},
+            )
+            for level, spp in enumerate((4, 16))
+        )
+    ]
+    root = made(tmp_path / "set", {"a": frames, "b": [replace(f, scene="b") for f in frames[:1]]})
+    rows = {row["recipe"]: row for row in data_page.patch_rows(FrameSet(root))}
+    assert list(rows) == [None, *RECIPES]
+    for recipe, row in rows.items():
+        options = recipe_options(recipe, {"samples": "none"})
+        planned = Counter()
+        for plan in plan_shards(FrameSet(root), options):
+            planned[plan.split] += len(plan.samples)
+        assert row["counts"] == planned
+    text = report(root, tmp_path)[1]
+    assert f"<td>≤ {rows['afgsa']['counts']['train']}</td>" in text
+    assert "400 candidates, pruned by importance, 128×128" in text
+
+
+def test_sets_that_prepare_would_refuse_say_why_in_place_of_numbers(tmp_path):
+    text = report(made(tmp_path / "set", {"a": levels(), "b": levels("classroom")}), tmp_path)[1]
+    assert text.count(".exr is 48x32, smaller than a patch of 128x128") == 1 + len(RECIPES)
+    assert str(tmp_path) not in text
+
+
+def test_pairs_that_are_not_shown_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(data_page, "PAIRS", 1)
+    names = {"a": "train", "b": "train", "c": "test"}
+    frames = {name: [replace(sample_crop("classroom", 0), scene=name)] for name in names}
+    root = made(tmp_path / "set", frames, splits={"train": ["a", "b"], "validation": [], "test": ["c"]})
+    text = report(root, tmp_path)[1]
+    assert "2 more pairs of scenes are not shown, 1 of them in different splits" in text
+
+
+def test_long_lists_of_scenes_are_folded(tmp_path):
+    tiny = Frame({"color": np.ones((8, 8, 3), np.float32)}, "s", 0, exposure=1.0)
+    root = made(tmp_path / "set", {f"s{i:02d}": [replace(tiny, scene=f"s{i:02d}")] for i in range(27)})
+    text = report(root, tmp_path)[1]
+    assert "<summary>26 scenes of train</summary>" in text
 
 
 def test_checks_origin_recipe_and_reference_noise_are_on_the_page(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -15,8 +16,8 @@ import numpy as np
 from data.duplicates import Pair
 from data.frames import FrameSet
 from data.manifest import SPLITS, FrameRecord, Manifest, SceneRecord
-from data.patches import patch_count
-from data.shards.cut import PrepareOptions
+from data.shards.division import plan_shards
+from data.shards.options import RECIPES, recipe_options
 from data.statistics import Histogram
 from trainer.reports.findings import ENERGY_Z, FIREFLIES, Finding
 from trainer.reports.frame_facts import FrameFacts
@@ -115,7 +116,7 @@ def render(
     }
     manifest = frames.manifest
     scenes = [_scene_view(manifest, name, [f for f in facts if f.scene == name]) for name in manifest.scenes]
-    splits = split_rows(manifest)
+    splits, alike = split_rows(manifest), pair_rows(manifest, facts, pairs)
     return environment.get_template("data_report.html.j2").render(
         manifest=manifest,
         scenes=scenes,
@@ -126,13 +127,14 @@ def render(
         heat=heat_css(),
         splits=splits,
         split_bar=split_svg({r["split"]: r["frames"] for r in splits if r["frames"]}),
-        pairs=pair_rows(manifest, facts, pairs),
+        pairs=alike[:PAIRS],
+        more_pairs=alike[PAIRS:],
+        patches=patch_rows(frames),
         size=_size_text(manifest),
         bytes=sum(f.bytes for s in manifest.scenes.values() for f in s.frames),
         version=_version(),
         energy_z=ENERGY_Z,
         fireflies=FIREFLIES,
-        patches=PrepareOptions(),
     )
 
 
@@ -220,23 +222,35 @@ def noise_rows(scenes: Sequence[SceneView]) -> list[dict[str, Any]]:
 
 
 def split_rows(manifest: Manifest) -> list[dict[str, Any]]:
-    """Return one row per split: scenes, frames, pixels, and patches that `trainer prepare` would cut."""
-    options = PrepareOptions()
+    """Return one row per split: scenes, frames, pixels and bytes."""
     rows = []
     for split in SPLITS:
         names = manifest.splits.get(split, [])
-        records = [(i, f) for n in names for i, f in enumerate(manifest.scenes[n].frames)]
-        patches = sum(patch_count(options.train_patches, f.width, f.height, i) for i, f in records)
+        records = [f for n in names for f in manifest.scenes[n].frames]
         rows.append(
             {
                 "split": split,
                 "scenes": names,
                 "frames": len(records),
-                "pixels": sum(f.width * f.height for _, f in records),
-                "bytes": sum(f.bytes for _, f in records),
-                "patches": patches if split == "train" else None,
+                "pixels": sum(f.width * f.height for f in records),
+                "bytes": sum(f.bytes for f in records),
             }
         )
+    return rows
+
+
+def patch_rows(frames: FrameSet) -> list[dict[str, Any]]:
+    """Return what `trainer prepare` would plan, without a recipe and with each: samples of every split."""
+    rows = []
+    for recipe in (None, *RECIPES):
+        options = recipe_options(recipe, {"samples": "none"})
+        row: dict[str, Any] = {"recipe": recipe, "options": options, "counts": Counter(), "problem": ""}
+        try:
+            for plan in plan_shards(frames, options):
+                row["counts"][plan.split] += len(plan.samples)
+        except ValueError as error:
+            row["problem"] = str(error).replace(f"{frames.root}/", "")
+        rows.append(row)
     return rows
 
 
@@ -261,7 +275,7 @@ def pair_rows(manifest: Manifest, facts: Sequence[FrameFacts], pairs: Sequence[P
                 "count": len(group),
             }
         )
-    return sorted(rows, key=_urgency)[:PAIRS]
+    return sorted(rows, key=_urgency)
 
 
 def _urgency(row: Mapping[str, Any]) -> tuple[bool, bool, float]:

@@ -87,15 +87,17 @@ def make_jobs(frames: FrameSet) -> list[FrameJob]:
     jobs = []
     for number, (name, scene) in enumerate(manifest.scenes.items()):
         shown, columns = shown_frame(scene), column_frames(scene)
-        second = scene.frames[1].index if scene.sequence and len(scene.frames) > 1 else None
+        first, second = [*scene.frames, None][:2] if scene.sequence else (None, None)
         for record in scene.frames:
             pictures: Pictures = "none"
             if record.index == shown.index:
                 pictures = "all" if number < whole else "main"
             large = record.index == shown.index and max(record.width, record.height) > limit
             column = large or any(record.index == c.index for c in columns)
-            motion = record.index == second
-            jobs.append(FrameJob(str(frames.root), name, record, pictures, limit, column, motion))
+            before = (
+                first.file if first and second and record.index == second.index == first.index + 1 else ""
+            )
+            jobs.append(FrameJob(str(frames.root), name, record, pictures, limit, column, before))
     return jobs
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from data.buffers import buffer
 from data.derive import derive
 from data.duplicates import Fingerprint, fingerprint
-from data.exr import RadianceWarning, looks_encoded
+from data.exr import RadianceWarning, looks_encoded, read_frame
 from data.frame import Frame
 from data.frames import FrameSet
 from data.importance import CANDIDATES, importance_map, importance_positions
@@ -66,7 +66,8 @@ class FrameJob:
         pictures: Which thumbnails to make beside the small one of `color`.
         limit: Largest side of a thumbnail in pixels.
         column: Show the middle of the frame in full size, beside other numbers of samples of the same view.
-        motion: Show the motion: the second frame of a sequence stands in for the first one, which has none.
+        before: File of the preceding frame, where the motion is to be shown: the second frame of a sequence
+            stands in for the first one, which has none.
     """
 
     root: str
@@ -75,7 +76,7 @@ class FrameJob:
     pictures: Pictures
     limit: int
     column: bool = False
-    motion: bool = False
+    before: str = ""
 
 
 @dataclass(eq=False)
@@ -146,6 +147,8 @@ def look_at(job: FrameJob) -> FrameFacts:
         facts.details = describe_frame(frame)
     frame = _with_color(frame)
     facts.buffers = tuple(frame.buffers)
+    if job.before and "motion" not in frame.buffers:
+        frame = _with_motion(frame, Path(job.root) / job.before)
     _measure(facts, frame)
     _judge(facts, frame)
     _draw(facts, frame, job)
@@ -173,6 +176,14 @@ def _with_color(frame: Frame) -> Frame:
     mean = samples.get("radiance").mean(0, dtype=np.float64).astype(np.float32)
     frame = frame.with_buffers(color=mean)
     return derive(frame, ["irradiance"]) if "albedo" in frame.buffers else frame
+
+
+def _with_motion(frame: Frame, before: Path) -> Frame:
+    """Return the frame with the motion that follows from its positions and the camera of the frame before."""
+    try:
+        return derive(frame, ["motion"], previous=read_frame(before).camera)
+    except (OSError, ValueError):
+        return frame
 
 
 def _measure(facts: FrameFacts, frame: Frame) -> None:
@@ -246,7 +257,7 @@ def _draw(facts: FrameFacts, frame: Frame, job: FrameJob) -> None:
     if job.column:
         shown = {n: window(b[n], job.limit) for n in ("color", "reference") if n in b}
         facts.columns = {n: buffer_thumbnail(n, image, exposure, job.limit) for n, image in shown.items()}
-    if job.motion and "motion" in b:
+    if job.before and "motion" in b:
         facts.thumbnails["motion"] = buffer_thumbnail("motion", b["motion"], exposure, job.limit)
     if job.pictures == "none":
         return
