@@ -22,7 +22,7 @@ from pathlib import Path
 
 from data.frame import Frame
 from data.layouts.channels import missing_buffer
-from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.scene import Scene, all_frames, require_folder, subfolders
 from data.layouts.siblings import View, read_siblings, reference_parts, require_files
 
 ROLES = {
@@ -47,7 +47,7 @@ def likeness(root: Path) -> float:
     """Return the fraction of EXR files that are called as in this layout."""
     if not root.is_dir():
         return 0.0
-    folders = [root, *_folders(root)]
+    folders = [root, *subfolders(root)]
     names = [path.name for folder in folders for path in folder.glob("*.exr")]
     crops = sum(_CROP.fullmatch(n) is not None for n in names)
     tests = [m for n in names if (m := _TEST.fullmatch(n))]
@@ -64,7 +64,7 @@ def describe(root: str | Path) -> list[Scene]:
     """
     root = Path(root)
     require_folder(root)
-    scenes = [_training(root, folder) for folder in (root, *_folders(root)) if _crops(folder)]
+    scenes = [_training(root, folder) for folder in (root, *subfolders(root)) if _crops(folder)]
     scenes += [_test(root, name) for name in sorted({m["name"] for _, m in _matches(root, _TEST)})]
     if not scenes:
         raise ValueError(
@@ -94,10 +94,6 @@ def read(folder: Path, test: str | None, scene: str, index: int) -> Frame:
     """
     view = (_crops(folder) if test is None else _tests(folder, test))[index]
     return read_siblings(view, NEEDED, scene, index)
-
-
-def _folders(root: Path) -> list[Path]:
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
 
 
 def _training(root: Path, folder: Path) -> Scene:

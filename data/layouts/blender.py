@@ -32,7 +32,7 @@ from data.frame import Frame, Image
 from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.scene import Scene, all_frames, require_folder
 from data.layouts.twins import Job, SceneFiles, scenes_of
-from data.layouts.walk import LOOK, files_below
+from data.layouts.walk import a_few_below
 
 FAR = 1e9
 """Depths from here on are misses in float files; Blender writes 1e10."""
@@ -56,17 +56,13 @@ _ALIASES = {
 _WANTED = {"albedo": ("Denoising Albedo", "DiffCol"), "normal": ("Normal", "Denoising Normal")}
 _REFLECTANCES = ("Denoising Albedo", "DiffCol", "GlossCol", "TransCol")
 _UNSAFE = re.compile(r"[^\w.-]+")
-_MOST_OPENED = 4
 
 _Passes = dict[str, dict[str, str]]
 
 
 def likeness(root: Path) -> float:
     """Return the fraction of a few EXR files below a root that have passes of Cycles."""
-    if not root.is_dir():
-        return 0.0
-    paths = files_below(root, (".exr",), LOOK)
-    opened = paths[:: max(1, len(paths) // _MOST_OPENED)][:_MOST_OPENED]
+    opened = a_few_below(root, ".exr")
     return sum(_has_passes(p) for p in opened) / len(opened) if opened else 0.0
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from data.exr import read_frame
 from data.frame import Frame
 from data.layouts.bmfr_camera import BmfrCameras, read_cameras
-from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.scene import Scene, all_frames, require_folder, subfolders
 
 ROLES = {
     "color": "irradiance",
@@ -123,7 +123,7 @@ def _parsed(header: Path, changed: int, size: int) -> BmfrCameras:
 def _folders(root: Path) -> list[Path]:
     if _files(_inputs(root)):
         return [root]
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return subfolders(root)
 
 
 def _inputs(folder: Path) -> Path:

@@ -21,7 +21,7 @@ from data.derive import derive
 from data.exr_image import exr_channels, read_exr
 from data.frame import Frame
 from data.layouts.channels import DEFAULT, REFERENCE_WORDS, Gathering, channel_groups, missing_buffer
-from data.layouts.scene import Scene
+from data.layouts.scene import Scene, subfolders
 from data.layouts.siblings import absent, reference_parts, with_reference
 
 GROUPS = {
@@ -145,7 +145,7 @@ def read(root: Path, needed: tuple[str, ...], scene: str, index: int) -> Frame:
 def _folders(root: Path) -> list[Path]:
     if not root.is_dir():
         return []
-    return [root, *sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))]
+    return [root, *subfolders(root)]
 
 
 def _check_references(layout: str, root: Path, folder: Path) -> None:

@@ -31,18 +31,14 @@ from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.mitsuba_names import MOMENT, Roles, roles_of
 from data.layouts.scene import Scene, all_frames, require_folder
 from data.layouts.twins import Job, SceneFiles, scenes_of
-from data.layouts.walk import LOOK, files_below
+from data.layouts.walk import a_few_below
 
 _UNIT_SHARE = 0.75
-_MOST_OPENED = 4
 
 
 def likeness(root: Path) -> float:
     """Return the fraction of a few EXR files below a root that look like an AOV film."""
-    if not root.is_dir():
-        return 0.0
-    paths = files_below(root, (".exr",), LOOK)
-    opened = paths[:: max(1, len(paths) // _MOST_OPENED)][:_MOST_OPENED]
+    opened = a_few_below(root, ".exr")
     return sum(_score(p) for p in opened) / len(opened) if opened else 0.0
 
 

@@ -27,7 +27,7 @@ from data.exr_image import read_exr
 from data.frame import Frame, Image
 from data.layouts.bmfr_camera import read_cameras
 from data.layouts.channels import Gathering, missing_buffer
-from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.scene import Scene, all_frames, require_folder, subfolders
 from data.layouts.siblings import only_group
 
 PLACES = {
@@ -115,7 +115,7 @@ def _sources(accumulated: bool, exact_depth: bool) -> dict[str, str]:
 def _folders(root: Path) -> list[Path]:
     if _files(root):
         return [root]
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return subfolders(root)
 
 
 def _looks_like(folder: Path) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 from data.camera import Camera
 from data.exr import read_frame
 from data.frame import Frame
-from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.scene import Scene, all_frames, require_folder, subfolders
 
 _SIDECAR = "sequence.json"
 _INPUT = re.compile(r"f(\d+)_(?:input|samples)\.exr$")
@@ -61,7 +61,7 @@ def frames(root: str | Path) -> Iterator[Frame]:
 def _folders(root: Path) -> list[Path]:
     if (root / _SIDECAR).is_file():
         return [root]
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return subfolders(root)
 
 
 def _is_scene(folder: Path) -> bool:

@@ -44,6 +44,11 @@ def all_frames(scenes: list[Scene]) -> Iterator[Frame]:
             yield scene.read(index)
 
 
+def subfolders(root: Path) -> list[Path]:
+    """Return the folders directly in a folder, sorted, hidden ones left out."""
+    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
 def require_folder(root: Path) -> None:
     """Raise an error unless the root is a folder with something in it."""
     if not root.exists():

@@ -23,7 +23,7 @@ from pathlib import Path
 from data.buffers import BUFFERS
 from data.frame import Frame
 from data.layouts.channels import REFERENCE_WORDS, missing_buffer
-from data.layouts.scene import Scene, all_frames, require_folder
+from data.layouts.scene import Scene, all_frames, require_folder, subfolders
 from data.layouts.siblings import View, absent, read_siblings, require_files
 
 OUTPUTS = {
@@ -96,7 +96,7 @@ def read(folder: Path, scene: str, index: int) -> Frame:
 def _folders(root: Path) -> list[Path]:
     if _views(root):
         return [root]
-    return sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
+    return subfolders(root)
 
 
 def _looks_like(folder: Path) -> bool:

@@ -11,6 +11,12 @@ LOOK = 8192
 """Entries that a look passes over: enough to know a layout by, a fraction of a second in any folder."""
 
 
+def a_few_below(root: Path, ending: str, count: int = 4) -> list[Path]:
+    """Return a few of the files with an ending below a folder, spread over those that a look finds."""
+    found = files_below(root, (ending,), LOOK) if root.is_dir() else []
+    return found[:: max(1, len(found) // count)][:count]
+
+
 def files_below(root: Path, endings: tuple[str, ...] = ("",), most: int | None = None) -> list[Path]:
     """Return the files below a folder; hidden ones and links to folders are passed over.
 

@@ -177,6 +177,7 @@ def test_a_look_at_a_large_folder_passes_over_few_entries(tmp_path, monkeypatch)
     for name in LAYOUTS:
         opened.clear()
         monkeypatch.setattr(f"data.layouts.{name}.LOOK", 30, raising=False)
+        monkeypatch.setattr("data.layouts.walk.LOOK", 30)
         assert layout(name).likeness(tmp_path) == 0
         assert len(opened) <= 40, name
 

@@ -109,9 +109,9 @@ def _resembled(root: Path) -> str:
 def _resembled_below(root: Path) -> str:
     """Return which of the first subfolders resemble a layout, for a root that holds several data sets."""
     from data.layouts import likeliest
+    from data.layouts.scene import subfolders
 
-    folders = sorted(p for p in root.iterdir() if p.is_dir() and not p.name.startswith("."))
-    found = {folder.name: likeliest(folder) for folder in folders[:_SUBFOLDERS]}
+    found = {folder.name: likeliest(folder) for folder in subfolders(root)[:_SUBFOLDERS]}
     return ", ".join(f"{name}/ is {layout}" for name, layout in found.items() if layout)
 
 
