@@ -102,8 +102,8 @@ def at_counts(
             done += step
             if before + step in finished:
                 # Nothing is added to the sums of the last count, so that they need no copy.
-                kept = band if before + step == last else {n: _copy(m) for n, m in band.items()}
-                finished[before + step][rows.start] = kept
+                whole = before + step == last
+                finished[before + step][rows.start] = {n: m if whole else _copy(m) for n, m in band.items()}
         for count in counts:
             if sum(_rows(band) for band in finished[count].values()) == height:
                 yield count, _joined(finished.pop(count))
@@ -121,15 +121,17 @@ def _copy(moments: Moments) -> Moments:
 
 
 def _joined(bands: dict[int, dict[str, Moments]]) -> dict[str, Moments]:
+    """Return the sums of the whole image; the bands' own are given up one by one, to save memory."""
     parts = [bands[start] for start in sorted(bands)]
     if len(parts) == 1:
         return parts[0]
-    return {
-        name: Moments(
-            parts[0][name].count,
-            np.concatenate([p[name].even for p in parts]),
-            np.concatenate([p[name].odd for p in parts]),
-            np.concatenate([p[name].squares for p in parts]),
+    result = {}
+    for name in list(parts[0]):
+        moments = [part.pop(name) for part in parts]
+        result[name] = Moments(
+            moments[0].count,
+            np.concatenate([m.even for m in moments]),
+            np.concatenate([m.odd for m in moments]),
+            np.concatenate([m.squares for m in moments]),
         )
-        for name in parts[0]
-    }
+    return result
