@@ -14,9 +14,10 @@ import pytest
 
 from data.camera import motion
 from data.frames import FrameSet
+from data.manifest import FrameRecord, Manifest, SceneRecord
 from data.render.references import ENERGY_LIMIT
 from trainer.cli import main
-from trainer.commands.render import _resumable
+from trainer.commands.render import _resumable, _summary
 from trainer.progress import SampleRate
 
 SCENE = """<scene version="3.0.0">
@@ -206,6 +207,19 @@ def test_a_broken_scene_is_one_line_with_the_file(scene, tmp_path, monkeypatch, 
     err = capsys.readouterr().err
     assert "scene.xml" in err
     assert "plasticine" in err
+
+
+def test_the_summary_names_own_files_that_were_passed_over(tmp_path, capsys):
+    checks = {"energy_z": 0.5, "reference_relmse": 0.01}
+    record = FrameRecord(
+        0, "a/f000.exr", bytes=9, sha256="0" * 64, width=24, height=16, exposure=1.0, checks=checks
+    )
+    origin = {"assets": {"skipped": ["a.obj: holds no triangles"]}}
+    scenes = {name: SceneRecord((record,), origin=origin) for name in ("a", "b")}
+    splits = {"train": ["a", "b"]}
+    manifest = Manifest("set", "render", "euclidean", splits, scenes)
+    assert _summary(tmp_path, manifest) == 0
+    assert "1 of your files cannot be used and were passed over: a.obj: holds" in capsys.readouterr().out
 
 
 def children(pid):

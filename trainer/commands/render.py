@@ -299,5 +299,15 @@ def _summary(output: Path, manifest: Any) -> int:
             "standard errors from its reference's: rare bright paths (a higher --reference-spp shows), or a "
             "defect"
         )
+    skipped = sorted({said for scene in manifest.scenes.values() for said in _skipped(scene.origin)})
+    if skipped:
+        told = "; ".join(skipped[:5]) + (f"; and {len(skipped) - 5} more" if len(skipped) > 5 else "")
+        print(f"warning: {len(skipped)} of your files cannot be used and were passed over: {told}")
     print(f"next: trainer inspect {output} --html report.html; trainer prepare {output} --output SHARDS")
     return 1 if far else 0
+
+
+def _skipped(origin: dict[str, Any]) -> list[str]:
+    """Return what a scene's origin says of the user's files that could not be read."""
+    skipped: list[str] = (origin.get("assets") or {}).get("skipped", [])
+    return skipped
