@@ -10,6 +10,7 @@ from data.derive import automatic_exposure
 from data.exr import read_frame
 from data.frames import FrameSet
 from data.ingestion import PARTIAL, IngestOptions, ingest
+from data.layouts import LAYOUTS
 from data.manifest import MANIFEST
 from tests.data import layout_samples as layer_samples
 from tests.data.miniature import (
@@ -314,6 +315,14 @@ def test_a_folder_of_several_data_sets_is_told_what_its_subfolders_are(penumbra,
     bmfr.rename(tmp_path / "both" / "b")
     with pytest.raises(ValueError, match=r"resembles none .*; in it, a/ is penumbra, b/ is bmfr: name one"):
         call(tmp_path / "both", "--output", tmp_path / "set")
+
+
+def test_the_help_names_every_layout():
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    text = " ".join(parser.format_help().split())
+    assert "arranged: bmfr (BMFR, WSKP), nbgd, " in text
+    assert all(name in command.KNOWN for name in LAYOUTS)
 
 
 def test_one_view_is_not_called_views():

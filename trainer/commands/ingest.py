@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layout",
         default="auto",
-        help=f"how the source is arranged: {', '.join(KNOWN)}; default: the one that it resembles most",
+        help=f"how the source is arranged: {KNOWN}; default: the one that it resembles most",
     )
     parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the data set")
     parser.add_argument(
