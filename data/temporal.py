@@ -184,17 +184,21 @@ def blend(
 
 
 def _previous_pixels(frame: Frame, last: Frame) -> tuple[NDArray[np.float32], str]:
-    """Return where each pixel's surface was, as array indices (H, W, 2) in x, y; NaN where it was nowhere."""
-    moved = np.full((frame.height, frame.width, 2), np.nan, np.float32)
+    """Return where each pixel's surface was, as indices x and y (2, H, W); NaN where nowhere."""
+    moved = np.full((2, frame.height, frame.width), np.nan, np.float32)
     if "motion" in frame.buffers:
-        rows, columns = np.mgrid[0 : frame.height, 0 : frame.width].astype(np.float32)
-        moved = np.stack([columns, rows], -1) + frame.buffers["motion"]
+        moved[1], moved[0] = np.mgrid[0 : frame.height, 0 : frame.width]
+        moved += frame.buffers["motion"].transpose(2, 0, 1)
     if "position" in frame.buffers and "position" in last.buffers and last.camera is not None:
         pixels, w = project(last.camera, np.ascontiguousarray(frame.buffers["position"]))
         offset = (0.5, 0.5) if frame.camera is None else frame.camera.offset
-        pixels -= offset
-        pixels[w <= 0] = np.nan
-        return np.where(no_hit(frame), moved, pixels).astype(np.float32), "position and the preceding camera"
+        found = np.empty_like(moved)
+        with np.errstate(over="ignore", invalid="ignore"):  # of points behind the camera
+            for axis in range(2):
+                np.subtract(pixels[..., axis], offset[axis], out=found[axis], casting="same_kind")
+        np.copyto(found, np.float32(np.nan), where=w <= 0)
+        np.copyto(found, moved, where=no_hit(frame)[..., 0])
+        return found, "position and the preceding camera"
     if "motion" in frame.buffers:
         return moved, "motion"
     raise ValueError(
@@ -217,14 +221,13 @@ def _gather(
     }
     planes = _planes([last.buffers[n] for n in ("irradiance", "history", *tests)])
     current = _planes([frame.buffers[n] for n in tests])
-    where = _planes([target])
     sums = np.empty((5, frame.height, frame.width), np.float32)
     for top in range(0, frame.height, _BAND):
         rows = slice(top, top + _BAND)
-        sums[:, rows] = _gather_band(planes, where[:, rows], current[:, rows], list(tests.values()))
+        sums[:, rows] = _gather_band(planes, target[:, rows], current[:, rows], list(tests.values()))
     kept = sums[4] > 0
-    mean = sums[:4] / np.where(kept, sums[4], np.float32(1))
-    return np.ascontiguousarray(mean[:3].transpose(1, 2, 0)), mean[3], kept
+    mean = np.asarray(sums[:4] / np.where(kept, sums[4], np.float32(1)), np.float32)
+    return mean[:3].transpose(1, 2, 0), mean[3], kept
 
 
 def _planes(images: list[Image]) -> NDArray[np.float32]:
@@ -260,19 +263,34 @@ def _gather_band(
     corner = np.where(near, corner, np.float32(-2))
     fraction = np.where(near, target - corner, np.float32(0))
     x0, y0 = corner.astype(np.intp)
+    across = [_neighbour(x0 + d, fraction[0] if d else 1 - fraction[0], width) for d in (0, 1)]
+    down = [_neighbour(y0 + d, fraction[1] if d else 1 - fraction[1], height) for d in (0, 1)]
     sums = np.zeros((5, *near.shape), np.float32)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            x, y = x0 + dx, y0 + dy
-            accepted = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            source = y.clip(0, height - 1) * width + x.clip(0, width - 1)
+    for row, inside_y, share_y in down:
+        row *= width
+        for column, inside_x, share_x in across:
+            source = row + column
+            accepted = inside_x & inside_y
             for i, limit in enumerate(limits):
-                differences = [current[3 * i + c] - flat[4 + 3 * i + c].take(source) for c in range(3)]
-                accepted &= sum(d * d for d in differences) < limit
-            across = fraction[0] if dx else 1 - fraction[0]
-            down = fraction[1] if dy else 1 - fraction[1]
-            weight = np.where(accepted, across * down, np.float32(0))
+                squares = np.zeros(near.shape, np.float32)
+                for c in range(3):
+                    difference = flat[4 + 3 * i + c].take(source)
+                    np.subtract(current[3 * i + c], difference, out=difference)
+                    difference *= difference
+                    squares += difference
+                accepted &= squares < limit
+            weight = share_x * share_y
+            weight *= accepted
             for c in range(4):
-                sums[c] += weight * flat[c].take(source)
+                value = flat[c].take(source)
+                value *= weight
+                sums[c] += value
             sums[4] += weight
     return sums
+
+
+def _neighbour(
+    index: NDArray[np.intp], share: NDArray[np.float32], number: int
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float32]]:
+    """Return a row or column of the four neighbours within the image, where it was within, and its weight."""
+    return index.clip(0, number - 1), (index >= 0) & (index < number), share

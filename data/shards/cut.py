@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data.derive import derive
+import numpy as np
+
 from data.exr import StoredFrame
-from data.frame import Frame
 from data.frames import FrameSet
 from data.importance import importance_candidates, importance_map
 from data.manifest import FrameRecord
@@ -115,9 +115,9 @@ def _accumulated(
             return
 
 
-def _planes(stored: StoredFrame, frame: Frame, name: str) -> Planes:
+def _planes(stored: StoredFrame, name: str) -> Planes:
     half = stored.halves.get(name)
-    return Planes.of(name, frame.buffers[name]) if half is None else Planes(name, half, True)
+    return Planes.of(name, stored.frame.buffers[name]) if half is None else Planes(name, half, True)
 
 
 @dataclass(frozen=True)
@@ -186,10 +186,10 @@ class _Cutter:
 def _keep(stored: StoredFrame, options: PrepareOptions) -> _Kept:
     frame, halves = stored
     frame.require(*(name for name in ("reference", *options.buffers) if name not in halves))
-    single = not frame.accumulated and "history" not in halves
-    if single and "history" in options.stored and "irradiance" in frame.buffers.keys() | halves.keys():
-        frame = derive(frame, ["history"])
     has = frame.buffers.keys() | halves.keys()
+    if {"history"} - has and "history" in options.stored and "irradiance" in has and not frame.accumulated:
+        halves = {**halves, "history": np.ones((1, frame.height, frame.width), np.float16)}
+        has |= {"history"}
     depth = frame.buffers.get("depth")
     meta = {
         "scene": frame.scene,
@@ -199,7 +199,7 @@ def _keep(stored: StoredFrame, options: PrepareOptions) -> _Kept:
         "accumulated": frame.accumulated,
     }
     try:
-        planes = {name: _planes(stored, frame, name) for name in options.stored if name in has}
+        planes = {name: _planes(StoredFrame(frame, halves), name) for name in options.stored if name in has}
         if frame.samples is None or options.samples == "none":
             return _Kept(planes, meta, None)
         planes[SAMPLES] = Planes.of_samples(frame.samples, options.samples == "half")
