@@ -126,6 +126,8 @@ _LOOKED_AT = {
     "diffuse": ("specular", "color", "irradiance"),
     "specular": ("diffuse", "color", "irradiance"),
     "hit": ("depth",),
+    **{f"diffuse_{half}": (f"specular_{half}", f"color_{half}") for half in "ab"},
+    **{f"specular_{half}": (f"diffuse_{half}", f"color_{half}") for half in "ab"},
     **{
         f"albedo{part}": (f"diffuse_albedo{part}", f"specular_albedo{part}")
         for part in ("", "_a", "_b", "_variance")
@@ -179,6 +181,8 @@ class _Context:
             "motion": self._motion,
             "diffuse": partial(self._rest, "diffuse", "specular"),
             "specular": partial(self._rest, "specular", "diffuse"),
+            **{f"diffuse_{h}": partial(self._rest_of_half, "diffuse", "specular", h) for h in "ab"},
+            **{f"specular_{h}": partial(self._rest_of_half, "specular", "diffuse", h) for h in "ab"},
             "hit": self._hit,
             "history": self._history,
         }
@@ -276,6 +280,15 @@ class _Context:
             raise self._fail(name, "color")
         rest = self.need("color") - self.frame.buffers[other]
         return np.maximum(rest, 0), f"color - {other}, at least 0"
+
+    def _rest_of_half(self, name: str, other: str, half: str) -> tuple[Image, str]:
+        """Return color - other of one half; not clipped, so that the mean of both halves stays right."""
+        needed = [f"color_{half}", f"{other}_{half}"]
+        for part in needed:
+            if part not in self.frame.buffers:
+                raise self._fail(f"{name}_{half}", part)
+        color, rest = (self.frame.buffers[part] for part in needed)
+        return color - rest, f"color_{half} - {other}_{half}"
 
     def _hit(self) -> tuple[Image, str]:
         return (self.need("depth") > 0).astype(np.float32), "depth > 0"

@@ -261,3 +261,16 @@ def test_halves_and_variance_of_the_albedo_follow_from_those_of_the_reflectance(
     frame = derive(frame_with(**names), [f"albedo_{half}", "albedo_variance"])
     assert np.array_equal(frame.buffers[f"albedo_{half}"], effective_albedo(reflectance.astype(np.float32)))
     assert np.array_equal(frame.buffers["albedo_variance"], noisy(4))
+
+
+def test_halves_of_specular_light_follow_from_those_of_color_and_diffuse():
+    rng = np.random.default_rng(5)
+    names = ("color_a", "color_b", "diffuse_a", "diffuse_b")
+    given = {name: rng.gamma(1, 1, (3, 4, 3)).astype(np.float32) for name in names}
+    result = derive(Frame(dict(given), "s", 0), ["specular_a", "specular_b"])
+    for half in "ab":
+        assert np.array_equal(
+            result.buffers[f"specular_{half}"], given[f"color_{half}"] - given[f"diffuse_{half}"]
+        )
+    with pytest.raises(ValueError, match=r"missing buffer 'specular_a'.*diffuse_a"):
+        derive(Frame({"color_a": given["color_a"]}, "s", 0), ["specular_a"])
