@@ -1,8 +1,14 @@
-"""The small data set that ships: real frames of three scenes, in ingested form, under `bmfr/`."""
+"""The small data sets that ship, in ingested form.
+
+`bmfr`: sequences of three known scenes. `stills` and `layers`: random scenes, made by `trainer render`.
+"""
 
 from pathlib import Path
 
-SAMPLES = {"bmfr": Path(__file__).parent / "bmfr"}
+FOLDER = Path(__file__).parent
+"""Where they lie."""
+
+SAMPLES = {name: FOLDER / name for name in ("bmfr", "stills", "layers")}
 """Name after `sample:` → folder."""
 
 TRAIN_PATCHES = 320

@@ -31,8 +31,8 @@ LIMIT_BYTES = 20_000_000
 TEST = {"stills": ("indoor-000006",), "layers": ("indoor-000104",)}
 
 RECIPES = {
-    "stills": Recipe("stills", 160, 160, (32,), 512),
-    "layers": Recipe("samples", 64, 64, (8,), 1024),
+    "stills": Recipe("stills", 160, 160, (32,), 256),
+    "layers": Recipe("samples", 64, 64, (8,), 512),
 }
 SEEDS = {"stills": range(1, 7), "layers": range(101, 105)}
 """Odd seeds are outdoor scenes, even ones indoor."""

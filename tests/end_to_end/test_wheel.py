@@ -30,7 +30,9 @@ def test_wheel_holds_packages_configurations_and_the_sample_only(wheel):
     assert "trainer/configs/defaults.yaml" in names
     assert "data/sample/bmfr/manifest.json" in names
     assert sum(name.endswith(".exr") for name in names) >= 3 * 6
-    assert wheel.stat().st_size < 25e6
+    assert {f"data/sample/{name}/manifest.json" for name in ("stills", "layers")} <= set(names)
+    assert "trainer/reports/data_report.html.j2" in names
+    assert wheel.stat().st_size < 42e6
 
 
 @pytest.mark.slow
