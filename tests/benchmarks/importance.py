@@ -3,8 +3,9 @@
     python -m tests.benchmarks.importance
 
 Noise of a patch is the mean of (color - reference)^2 / (reference^2 + 0.01), its relative mean squared error.
-The frames of the sample have 320x180 pixels, a quarter of the side that the numbers are published for, so
-patches are 32x32 and candidates 400: the same picture, scaled down. Both ways get the same number of patches.
+The frames of the samples are 320 (1 spp sequences) and 160 pixels wide (32 spp stills), a quarter and an
+eighth of what the numbers are published for, so patches are 32x32 and 16x16 and candidates 400: the same
+picture, scaled down. Both ways get the same number of patches.
 Time is processor time, that of one core, for 400 candidates of 128x128 on 1280x720 pixels, a sample frame
 tiled four by four.
 """
@@ -34,9 +35,15 @@ def noise(frame: Frame, positions: list[Position], patch: int) -> list[float]:
     return [float(cut(error, position, patch).mean()) for position in positions]
 
 
+def frames_of(sample: str) -> list[Frame]:
+    """Return all frames of a sample."""
+    frames = FrameSet(SAMPLES[sample])
+    return [frames.read(scene, record.index) for scene in frames.scenes() for record in frames.frames(scene)]
+
+
 def compare(frame: Frame, floor: float) -> tuple[float, float, int]:
     """Return the mean noise of chosen and of as many uniform patches, and how many there are."""
-    patch = PATCH // SCALE
+    patch = PATCH * frame.width // 1280
     importance = importance_map(frame.buffers["color"], frame.buffers["normal"], patch, floor)
     seed = (1, frame.scene, frame.index)
     chosen = importance_positions(importance, CANDIDATES, patch, seed)
@@ -59,18 +66,21 @@ def seconds(color: Image, normal: Image) -> tuple[float, float]:
 
 def run() -> list[Row]:
     """Measure and return the rows."""
-    frames = FrameSet(SAMPLES["bmfr"])
-    read = [frames.read(scene, record.index) for scene in frames.scenes() for record in frames.frames(scene)]
     rows = []
-    for floor in FLOORS:
-        found = [compare(frame, floor) for frame in read]
-        ratio = statistics.fmean(chosen for chosen, _, _ in found) / statistics.fmean(u for _, u, _ in found)
-        kept = statistics.fmean(number for _, _, number in found)
-        rows += [
-            row(f"relative noise, chosen / uniform patches, floor {floor:g}", ratio, "x"),
-            row(f"kept of {CANDIDATES} candidates, floor {floor:g}", kept, ""),
-        ]
-    color, normal = (np.tile(read[0].buffers[name], (SCALE, SCALE, 1)) for name in ("color", "normal"))
+    for name in ("bmfr", "stills"):
+        read = frames_of(name)
+        for floor in FLOORS:
+            found = [compare(frame, floor) for frame in read]
+            ratios = [chosen / uniform for chosen, uniform, _ in found]
+            kept = statistics.fmean(number for _, _, number in found)
+            means = [statistics.fmean(part) for part in zip(*found, strict=True)]
+            rows += [
+                row(f"{name}: relative noise, chosen / uniform, floor {floor:g}", means[0] / means[1], "x"),
+                row(f"{name}: the same, median over frames, floor {floor:g}", statistics.median(ratios), "x"),
+                row(f"{name}: kept of {CANDIDATES} candidates, floor {floor:g}", kept, ""),
+            ]
+    first = frames_of("bmfr")[0]
+    color, normal = (np.tile(first.buffers[name], (SCALE, SCALE, 1)) for name in ("color", "normal"))
     times = [seconds(color, normal) for _ in range(REPEATS)]
     mapping, choosing = (statistics.median(part) for part in zip(*times, strict=True))
     total = statistics.median(map(sum, times))
