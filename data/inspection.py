@@ -80,6 +80,9 @@ def describe_frame(frame: Frame) -> dict[str, Any]:
             }
             for name, image in frame.buffers.items()
         },
+        "samples": None
+        if frame.samples is None
+        else {"count": frame.samples.count, "quantities": list(frame.samples.names)},
         "ignored": frame.notes.get("ignored", []),
         "derived": frame.notes.get("derived", {}),
     }

@@ -269,3 +269,8 @@ def test_a_page_is_refused_for_what_is_no_data_set_with_the_way_to_one(tmp_path)
 def test_options_of_the_page_are_refused_without_it(tmp_path, option):
     with pytest.raises(ValueError, match=f"{option[0]} is for --html"):
         call(tmp_path, *option)
+
+
+def test_samples_kept_apart_are_listed_with_their_quantities(capsys):
+    assert call("sample:layers") == 0
+    assert "samples: 8 per pixel, each with radiance, normal, depth" in capsys.readouterr().out

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         from rich.console import Console
 
-        _PRINTERS[found["kind"]](found, Console())
+        _PRINTERS[found["kind"]](found, Console(width=None if sys.stdout.isatty() else 120))
     return 1 if found.get("problems") else 0
 
 
@@ -129,6 +129,9 @@ def _print_frame(found: Mapping[str, Any], console: Console, title: str = "") ->
         + (", irradiance accumulated" if found["accumulated"] else ""),
     )
     console.print(_buffer_table(found["buffers"]))
+    if found["samples"]:
+        apart = found["samples"]
+        _line(console, f"samples: {apart['count']} per pixel, each with {', '.join(apart['quantities'])}")
     for name, rule in found["derived"].items():
         _line(console, f"derived: {name} = {rule}")
     if found["ignored"]:
@@ -141,12 +144,13 @@ def _buffer_table(buffers: Mapping[str, Any]) -> Any:
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("buffer", no_wrap=True)
-    table.add_column("from", overflow="fold")
-    table.add_column("type")
+    table.add_column("from", overflow="fold", min_width=4)
+    table.add_column("type", no_wrap=True)
     for title in ("min", "median", "max", "NaN/Inf %", "no hit %"):
         table.add_column(title, justify="right", no_wrap=True)
     for name, b in buffers.items():
         source = _joined(b.get("channels", [])) or "x".join(map(str, b.get("shape", [])))
+        source = source.removeprefix(f"{name}.")
         numbers = (b.get("min"), b.get("median"), b.get("max"), b["non_finite_percent"], b["no_hit_percent"])
         table.add_row(name, source, b["type"], *("" if n is None else f"{n:.3g}" for n in numbers))
     return table
