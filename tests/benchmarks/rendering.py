@@ -94,7 +94,7 @@ def together(processes: int, variant: Variant) -> float:
     """Return the samples per second of several processes with one thread each."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, activate, (variant, 1)) as pool:
-        start = time.time() + 90 + 30 * (processes - 1)
+        start = time.time() + 60 + 15 * (processes - 1)
         return sum(pool.map(speed, [start] * processes))
 
 

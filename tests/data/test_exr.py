@@ -438,3 +438,13 @@ def test_channels_are_listed_without_reading_pixels(tmp_path):
     parts = [OpenEXR.Part({}, {"Z": noise()[..., 0].copy()}, name=name) for name in ("depth", "alpha")]
     OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
     assert exr_channels(tmp_path / "parts.exr") == list(read_exr(tmp_path / "parts.exr").channels)
+
+
+def test_our_own_files_are_not_suspected_again(tmp_path):
+    sky = np.ones((20, 24, 3), np.float32)
+    sky[5:, :] = noise()[5:] / 40
+    write_frame(Frame({"color": sky.clip(0, 1)}, "s", 0), tmp_path / "own.exr")
+    read_frame(tmp_path / "own.exr")
+    write_exr(tmp_path / "other.exr", {f"color.{c}": sky[..., i].clip(0, 1) for i, c in enumerate("RGB")})
+    with pytest.warns(RadianceWarning, match="clipped at 1"):
+        read_frame(tmp_path / "other.exr")

@@ -303,9 +303,10 @@ def test_a_picture_given_as_radiance_is_a_note_not_an_error(
 ) -> None:
     clipped = frame(0)
     clipped.buffers["color"] = np.minimum(clipped.buffers["color"], 1)
+    write_raw(tmp_path / "in" / "f000.exr", clipped)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run("--model", "Exposed", folder_of(tmp_path / "in", clipped), "--output", tmp_path / "out")
+        run("--model", "Exposed", tmp_path / "in", "--output", tmp_path / "out")
     assert "note: " in capsys.readouterr().err
 
 
