@@ -7,28 +7,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from data.shards.progress import duration
+from data.shards.progress import Rate, duration
 
 INTERVAL = 15.0
 """Seconds between plain lines."""
 
 
-class SampleRate:
-    """Describes progress as millions of samples, their rate, and the time left.
-
-    What was done before the first call does not count for the rate.
-    """
-
-    def __init__(self) -> None:
-        self._start: tuple[float, int] | None = None
+class SampleRate(Rate):
+    """Describes progress as millions of samples, their rate, and the time left."""
 
     def text(self, done: int, total: int) -> str:
         """Return `12.3/80.0 M samples, 0.35 M/s, 3:13 left`; small amounts in thousands."""
-        now = time.monotonic()
-        if self._start is None:
-            self._start = (now, done)
-        begun, before = self._start
-        rate = (done - before) / (now - begun) if now > begun else 0.0
+        rate = self.per_second(done)
         unit, letter = (1e6, "M") if total >= 1e6 else (1e3, "k")
         text = f"{done / unit:.1f}/{total / unit:.1f} {letter} samples"
         if rate > 0:

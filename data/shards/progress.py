@@ -25,13 +25,17 @@ class Rate:
         self.unit = unit
         self._start: tuple[float, int] | None = None
 
-    def text(self, done: int, total: int) -> str:
-        """Return `12/80 samples, 34.5/s, 0:02 left`."""
+    def per_second(self, done: int) -> float:
+        """Return the samples per second since the first call, 0 at that call."""
         now = time.monotonic()
         if self._start is None:
             self._start = (now, done)
         begun, before = self._start
-        rate = (done - before) / (now - begun) if now > begun else 0.0
+        return (done - before) / (now - begun) if now > begun else 0.0
+
+    def text(self, done: int, total: int) -> str:
+        """Return `12/80 samples, 34.5/s, 0:02 left`."""
+        rate = self.per_second(done)
         text = f"{done}/{total} {self.unit}"
         if rate > 0 and done < total:
             text += f", {rate:.1f}/s, {duration((total - done) / rate)} left"
