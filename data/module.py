@@ -55,9 +55,10 @@ class Shards(LightningDataModule):
         on_corrupt: What to do about a damaged sample: `raise` an error, or `skip` it, with a warning for
             each.
         verify: Compare each sample with its checksum when a process reads it for the first time.
-        buffers: Buffers that the network reads; these and `reference` are delivered, in evaluation also
+        buffers: Buffers that the network reads; these and `targets` are delivered, in evaluation also
             `color` and `history`. None: all that the shards hold. The command line fills it in from the
-            network.
+            network. Where the root is prepared here, they are among what is stored.
+        targets: Buffers that training compares with. The command line fills it in from the network.
         temporal: Deliver `irradiance` accumulated over preceding frames as stored, otherwise color / albedo
             of the frame alone. The command line fills it in from the network.
         recipe: How the root is prepared here, `bmfr`, `afgsa` or `layers` (see `trainer prepare --help`);
@@ -89,6 +90,7 @@ class Shards(LightningDataModule):
         temporal: bool = True,
         recipe: Literal["bmfr", "afgsa", "layers"] | None = None,
         spp: Sequence[int] | None = None,
+        targets: Sequence[str] = ("reference",),
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0:
@@ -104,16 +106,21 @@ class Shards(LightningDataModule):
         )
         if train_patches is None and recipe is None and root.startswith(SAMPLE):
             train_patches = TRAIN_PATCHES
+        usual = recipe_options(recipe, {}).stored
+        self.targets = tuple(dict.fromkeys(("reference", *targets)))
+        made = (*usual, "color", "irradiance", SAMPLES)  # one of the two follows from the other in a batch
+        beside = [name for name in (*(buffers or ()), *self.targets) if name not in made]
         explicit = {
             "patch_size": patch_size,
             "train_patches": train_patches,
             "validation_patches": validation_patches,
             "seed": seed,
             "spp": None if spp is None else tuple(spp),
+            "buffers": tuple(dict.fromkeys(beside)) or None,
         }
         self.options = recipe_options(recipe, explicit)
         self.on_corrupt, self.verify = on_corrupt, verify
-        for name in buffers or ():
+        for name in (*(buffers or ()), *targets):
             if name != SAMPLES:
                 buffer(name)
         self.buffers = None if buffers is None else tuple(buffers)
@@ -234,7 +241,7 @@ class Shards(LightningDataModule):
     def _names(self, reader: ShardReader, evaluation: bool) -> tuple[str, ...]:
         sample = self._first_readable(reader)
         held = available(sample)
-        wanted = held if self.buffers is None else (*self.buffers, "reference")
+        wanted = held if self.buffers is None else (*self.buffers, *self.targets)
         missing = [name for name in wanted if name not in held]
         if SAMPLES in missing:
             raise ValueError(

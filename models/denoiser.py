@@ -28,6 +28,18 @@ class Denoised(NamedTuple):
     state: Any = None
 
 
+class Pair(NamedTuple):
+    """What a paper's loss compares, in the domain where it compares.
+
+    Attributes:
+        output: What the network made, (B, 3, H, W), with its gradient.
+        target: What it should have made, of the same shape.
+    """
+
+    output: Tensor
+    target: Tensor
+
+
 class Denoiser(nn.Module):
     """Base class: raw buffers in, linear radiance out.
 
@@ -38,11 +50,15 @@ class Denoiser(nn.Module):
     Attributes:
         inputs: Names of the buffers that the method reads.
         frame_numbers: Names of the frame numbers that it reads when they are given.
-        halo: Pixels of context on each side that an output pixel depends on.
-        multiple: Height and width must divide by it; the tiler pads.
+        halo: Pixels on each side of a core that the core depends on; cores are rectangles whose sides lie at
+            multiples of `multiple`, single pixels where that is 1.
+        multiple: Side of the method's own grid. Tiles start at multiples of it; images of other sizes are
+            padded by repeating their last row and column, in the module and in the tiler alike.
         temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
         per_sample: Buffers carry a sample axis (B, S, C, H, W).
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
+        targets: Names of the buffers that training compares with.
+        compared: Names of the pairs that `training_pairs` returns.
     """
 
     inputs: tuple[str, ...] = ()
@@ -52,6 +68,8 @@ class Denoiser(nn.Module):
     temporal: bool = False
     per_sample: bool = False
     bytes_per_pixel: int = 500
+    targets: tuple[str, ...] = ("reference",)
+    compared: tuple[str, ...] = ("color",)
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise a batch of images.
@@ -71,6 +89,23 @@ class Denoiser(nn.Module):
         same result. Methods that look only at neighbourhoods return nothing.
         """
         return {}
+
+    def training_pairs(self, batch: Mapping[str, Any]) -> dict[str, Pair]:
+        """Return what the method's paper compares in training, one pair per name of `compared`.
+
+        Here it is exposed radiance, float32. Methods whose loss lives elsewhere return what they are
+        compared in, such as log(1 + radiance) or its diffuse and specular parts, before anything is clamped.
+
+        Args:
+            batch: Inputs, `targets` and frame numbers.
+        """
+        exposure = self.exposure(batch).float()
+        output = self(select(self, batch)).color.float()
+        return {"color": Pair(output * exposure, batch["reference"].float() * exposure)}
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Return the parameters in the groups that a paper trains differently; `all` where it does not."""
+        return {"all": list(self.parameters())}
 
     def deploy(self) -> Denoiser:
         """Return the form used for inference, equal to 1e-5; by default the module itself."""

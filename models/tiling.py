@@ -41,11 +41,11 @@ class Tileable(Protocol):
 
     @property
     def halo(self) -> int:
-        """Pixels of context on each side that an output pixel depends on."""
+        """Pixels that a core on the grid of `multiple` depends on, on each of its sides."""
 
     @property
     def multiple(self) -> int:
-        """Height and width must divide by it."""
+        """Side of the method's own grid, at whose multiples tiles start."""
 
     def measure(self, buffers: Mapping[str, Tensor], /) -> Mapping[str, Tensor]:
         """Return the numbers that need the whole frame."""

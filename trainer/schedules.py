@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -24,6 +26,8 @@ class OneCycle(LambdaLR):
     Raises:
         ValueError: `warmup` is not within [0, 1), or `start` or `end` not within (0, 1].
     """
+
+    interval = "step"
 
     def __init__(
         self, optimizer: Optimizer, warmup: float = 0.15, start: float = 0.1, end: float = 0.001
@@ -51,3 +55,42 @@ class OneCycle(LambdaLR):
         else:
             low, share = self.end, (1 - place) / (1 - self.warmup)
         return low + (1 - low) * 0.5 * (1 - math.cos(math.pi * share))
+
+
+class Halving(LambdaLR):
+    """The learning rate falls to a fraction at each milestone and is constant between.
+
+    Args:
+        optimizer: Whose learning rate is scheduled.
+        milestones: Finished epochs, or steps, after which it falls.
+        per: What milestones count: `epoch` or `step`.
+        factor: The fraction.
+
+    Raises:
+        ValueError: Milestones do not ascend from 1, or `per` or `factor` is wrong.
+    """
+
+    def __init__(
+        self,
+        optimizer: Optimizer,
+        milestones: Sequence[int] = (),
+        per: Literal["epoch", "step"] = "epoch",
+        factor: float = 0.5,
+    ) -> None:
+        if list(milestones) != sorted({m for m in milestones if m > 0}):
+            raise ValueError(f"milestones must be ascending positive numbers, got {list(milestones)}")
+        if per not in ("epoch", "step") or not 0 < factor < 1:
+            raise ValueError(
+                f"Halving: per {per!r}, factor {factor}; expected epoch or step, and 0 < factor < 1"
+            )
+        self.milestones, self.interval, self.decay = tuple(milestones), per, factor
+        super().__init__(optimizer, self.factor)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the position; milestones follow from the configuration, also of a resumed run."""
+        own = ("milestones", "interval", "decay")
+        return {key: value for key, value in super().state_dict().items() if key not in own}
+
+    def factor(self, count: int) -> float:
+        """Return the learning rate after `count` epochs or steps as a fraction of the first."""
+        return float(self.decay ** bisect.bisect_right(self.milestones, count))

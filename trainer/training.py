@@ -112,6 +112,11 @@ def net_inputs(net: Denoiser) -> tuple[str, ...]:
     return net.inputs
 
 
+def net_targets(net: Denoiser) -> tuple[str, ...]:
+    """Return the buffers that training compares with."""
+    return net.targets
+
+
 def net_temporal(net: Denoiser) -> bool:
     """Return whether the network expects accumulated input."""
     return net.temporal
@@ -148,6 +153,7 @@ class TrainingCLI(LightningCLI):
         """Let the data module deliver what the network reads."""
         net = "model.init_args.net"
         parser.link_arguments(net, "data.init_args.buffers", compute_fn=net_inputs, apply_on="instantiate")
+        parser.link_arguments(net, "data.init_args.targets", compute_fn=net_targets, apply_on="instantiate")
         parser.link_arguments(net, "data.init_args.temporal", compute_fn=net_temporal, apply_on="instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:

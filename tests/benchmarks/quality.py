@@ -23,7 +23,7 @@ from models import JointBilateral
 from models.denoiser import Denoiser, select
 from trainer.loading import load_model
 from trainer.metrics.collection import METRICS, SceneMetrics
-from trainer.modules.regression import noisy_input
+from trainer.modules.evaluation import noisy_input
 from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint
 from trainer.tracking import open_client
 

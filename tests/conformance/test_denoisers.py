@@ -13,10 +13,18 @@ import models
 from data.buffers import BUFFERS, FRAME_NUMBERS, buffer
 from models.denoiser import Denoiser, select
 from models.tiling import denoise_tiled
-from tests.models.frames import largest_relative, luminous, random_buffers
+from tests.models.frames import largest_relative, lit, luminous, split_buffers
 
 KERNEL_METHODS = {"WSKP", "JointBilateral"}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
+
+ARGUMENTS: dict[str, dict[str, Any]] = {}
+"""Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""
+
+
+def make(name: str) -> Denoiser:
+    made: Denoiser = getattr(models, name)(**ARGUMENTS.get(name, {}))
+    return made.eval()
 
 
 @pytest.fixture(params=models.__all__)
@@ -27,18 +35,20 @@ def name(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def denoiser(name: str) -> Denoiser:
     torch.manual_seed(7)
-    made: Denoiser = getattr(models, name)()
-    return made.eval()
+    return make(name)
 
 
 def inputs(
     denoiser: Denoiser, batch: int = 1, height: int = 32, width: int = 40, seed: int = 0
 ) -> dict[str, Tensor]:
     """Random buffers for a method, with the frame numbers that it reads."""
-    everything = random_buffers(batch, height, width, seed)
-    everything["color"] = everything["irradiance"] * everything["albedo"]
+    return select(denoiser, everything(batch, height, width, seed))
+
+
+def everything(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+    """Random buffers and frame numbers for any method."""
     numbers = {"exposure": torch.ones(batch), "depth_range": torch.tensor([[1.0, 6.0]]).repeat(batch, 1)}
-    return select(denoiser, {**everything, **numbers})
+    return {**split_buffers(batch, height, width, seed), **numbers}
 
 
 def test_the_catalogue_lists_exactly_the_denoisers() -> None:
@@ -76,24 +86,34 @@ def test_constant_irradiance_stays_constant_borders_included(
 ) -> None:
     if name not in KERNEL_METHODS:
         return
-    buffers = luminous(inputs(denoiser, 1, 33, 29), value)
+    whole = everything(1, 33, 29)
+    if "irradiance" not in denoiser.inputs:  # then what is filtered is divided by a slightly larger albedo
+        whole["albedo"] = torch.full_like(whole["albedo"], 0.5)
+    buffers = select(denoiser, lit(luminous(whole, value)))
     with torch.no_grad():
         found = denoiser(buffers).color / buffers["albedo"]
     torch.testing.assert_close(found, torch.full_like(found, value), rtol=1e-5, atol=0)
 
 
-def extreme(kind: str, buffers: dict[str, Tensor]) -> dict[str, Tensor]:
-    noisy = buffers["irradiance"].clone()
+def extreme(kind: str, denoiser: Denoiser, seed: int = 0) -> dict[str, Tensor]:
+    whole = everything(1, 32, 40, seed)
+    noisy = whole["irradiance"].clone()
     if kind == "black":
-        return {key: torch.zeros_like(value) for key, value in buffers.items() if key not in FRAME_NUMBERS}
+        black = {key: torch.zeros_like(value) for key, value in whole.items() if key not in FRAME_NUMBERS}
+        return select(denoiser, black)
     if kind == "bright":
-        return luminous(buffers, 65504.0)
+        noisy = torch.full_like(noisy, 65504.0)
     if kind == "fireflies":
         noisy[..., ::7, ::5] = 65504.0
     if kind == "one firefly in black":
         noisy = torch.zeros_like(noisy)
         noisy[..., 9, 11] = 1e9
-    return {**buffers, "irradiance": noisy}
+    return select(denoiser, lit({**whole, "irradiance": noisy}))
+
+
+def radiance(denoiser: Denoiser) -> str:
+    """Return the name of a buffer that a method filters."""
+    return next(name for name in denoiser.inputs if buffer(name).kind == "radiance")
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -101,7 +121,7 @@ def extreme(kind: str, buffers: dict[str, Tensor]) -> dict[str, Tensor]:
 def test_extreme_inputs_stay_finite_with_finite_gradients(
     denoiser: Denoiser, kind: str, precision: str
 ) -> None:
-    buffers = extreme(kind, inputs(denoiser))
+    buffers = extreme(kind, denoiser)
     with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
         color = denoiser(buffers).color
     assert color.dtype == torch.float32
@@ -125,16 +145,17 @@ def test_every_parameter_has_a_gradient(denoiser: Denoiser) -> None:
 
 def test_the_noisy_image_has_a_finite_gradient(denoiser: Denoiser) -> None:
     buffers = inputs(denoiser)
-    buffers["irradiance"][..., :8, :8] = 0.0
-    buffers["irradiance"].requires_grad_()
+    noisy = buffers[radiance(denoiser)]
+    noisy[..., :8, :8] = 0.0
+    noisy.requires_grad_()
     denoiser(buffers).color.sum().backward()
-    assert buffers["irradiance"].grad is not None
-    assert buffers["irradiance"].grad.isfinite().all()
-    assert buffers["irradiance"].grad.abs().max() > 0
+    assert noisy.grad is not None
+    assert noisy.grad.isfinite().all()
+    assert noisy.grad.abs().max() > 0
 
 
 def test_a_batch_element_never_influences_another(denoiser: Denoiser) -> None:
-    one, other = inputs(denoiser, 1, seed=1), extreme("fireflies", inputs(denoiser, 1, seed=2))
+    one, other = inputs(denoiser, 1, seed=1), extreme("fireflies", denoiser, seed=2)
     together = {key: torch.cat([one[key], other[key]]) for key in one}
     with torch.no_grad():
         alone, first = denoiser(one).color, denoiser(together).color[:1]
@@ -147,7 +168,16 @@ def test_the_deployed_form_is_equal(denoiser: Denoiser) -> None:
         expected = denoiser(buffers).color
         assert largest_relative(denoiser.deploy()(buffers).color, expected) < 1e-5
     deployed = denoiser.deploy()
-    for attribute in ("inputs", "frame_numbers", "halo", "multiple", "temporal", "per_sample"):
+    for attribute in (
+        "targets",
+        "compared",
+        "inputs",
+        "frame_numbers",
+        "halo",
+        "multiple",
+        "temporal",
+        "per_sample",
+    ):
         assert getattr(deployed, attribute) == getattr(denoiser, attribute)
 
 
@@ -169,30 +199,30 @@ def sensitive(denoiser: Denoiser) -> Denoiser:
 
 
 def test_the_halo_is_the_reach_no_more_and_no_less(denoiser: Denoiser) -> None:
-    network, halo = sensitive(denoiser), denoiser.halo
-    size = 2 * halo + 7
+    network, halo, side = sensitive(denoiser), denoiser.halo, denoiser.multiple
+    before = -(-(halo + 2) // side) * side  # an aligned core with room for the halo and two more pixels
+    size = before + side + before
     buffers = {key: value.double() for key, value in inputs(denoiser, 1, size, size).items()}
     images = [buffers[key] for key in denoiser.inputs]
     for image in images:
         image.requires_grad_()
-    centre = size // 2
-    gradients = torch.autograd.grad(
-        network(buffers).color[..., centre, centre].sum(), images, allow_unused=True
-    )
+    core = slice(before, before + side)
+    # Squares cannot cancel in the sum over the core.
+    total = network(buffers).color[..., core, core].square().sum()
+    gradients = torch.autograd.grad(total, images, allow_unused=True)
     reached = torch.zeros(size, size, dtype=torch.bool)
     for gradient in gradients:
         if gradient is not None:
             reached |= (gradient[0].abs() > 0).any(0)
     rows, columns = reached.nonzero().unbind(1)
-    assert centre - int(rows.min()) == halo
-    assert int(rows.max()) - centre == halo
-    assert centre - int(columns.min()) == halo
-    assert int(columns.max()) - centre == halo
+    for axis in (rows, columns):
+        reach = (before - int(axis.min()), int(axis.max()) - (before + side - 1))
+        assert max(reach) == halo
 
 
 def test_the_state_dict_round_trips(denoiser: Denoiser, name: str) -> None:
     torch.manual_seed(99)
-    other: Denoiser = getattr(models, name)().eval()
+    other = make(name)
     other.load_state_dict(denoiser.state_dict())
     buffers = inputs(denoiser)
     with torch.no_grad():
@@ -222,11 +252,13 @@ def test_a_buffer_of_another_shape_is_named(denoiser: Denoiser) -> None:
 
 def test_radiance_in_other_units_comes_back_in_those_units(denoiser: Denoiser) -> None:
     buffers = inputs(denoiser)
+    powers = {"radiance": 1, "variance": 2}
+    names = [n for n in denoiser.inputs if buffer(n.removesuffix("_variance")).kind == "radiance"]
+    scaled = {**buffers, **{n: buffers[n] * 50 ** powers[buffer(n).kind] for n in names}}
+    if "exposure" in denoiser.frame_numbers:
+        scaled["exposure"] = torch.tensor([1 / 50])
     with torch.no_grad():
         expected = denoiser(buffers).color
-        scaled = {**buffers, "irradiance": buffers["irradiance"] * 50}
-        if "exposure" in denoiser.frame_numbers:
-            scaled["exposure"] = torch.tensor([1 / 50])
         assert largest_relative(denoiser(scaled).color / 50, expected) < 1e-5
 
 
@@ -246,3 +278,26 @@ def test_a_traced_module_runs_at_another_size(denoiser: Denoiser) -> None:
         traced = torch.jit.trace(Positional(), tuple(small.values()), check_trace=False)
     with torch.no_grad():
         assert largest_relative(traced(*large.values()), denoiser(large).color) < 1e-5
+
+
+def test_training_pairs_are_what_is_announced_and_reach_every_parameter(denoiser: Denoiser) -> None:
+    denoiser.train()
+    pairs = denoiser.training_pairs(everything(2, 32, 40))
+    assert tuple(pairs) == denoiser.compared
+    for pair in pairs.values():
+        assert pair.output.shape == pair.target.shape
+        assert pair.output.dtype == pair.target.dtype == torch.float32
+        assert not pair.target.requires_grad
+    if any(True for _ in denoiser.parameters()):
+        torch.stack([(pair.output - pair.target).square().mean() for pair in pairs.values()]).sum().backward()
+        assert all(p.grad is not None and p.grad.abs().max() > 0 for p in denoiser.parameters())
+
+
+def test_parameter_groups_hold_every_parameter_once(denoiser: Denoiser) -> None:
+    grouped = [id(p) for group in denoiser.parameter_groups().values() for p in group]
+    assert sorted(grouped) == sorted(id(p) for p in denoiser.parameters())
+
+
+def test_targets_are_in_the_vocabulary(denoiser: Denoiser) -> None:
+    assert set(denoiser.targets) <= set(BUFFERS)
+    assert "reference" in denoiser.targets

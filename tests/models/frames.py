@@ -23,6 +23,24 @@ def random_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[s
     }
 
 
+def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+    """Return those and color, its diffuse and specular parts, references, and the variance of each."""
+    buffers = lit(random_buffers(batch, height, width, seed))
+    generator = torch.Generator().manual_seed(seed + 1000)
+    for name in ("color", "diffuse", "specular", "albedo", "normal", "depth"):
+        spread = torch.rand(buffers[name].shape, generator=generator) ** 4
+        buffers[f"{name}_variance"] = 0.05 * spread * buffers[name].square()
+    for name, source in (("reference", "color"), ("reference_diffuse", "diffuse")):
+        buffers[name] = torch.nn.functional.avg_pool2d(buffers[source], 5, 1, 2)
+    return buffers
+
+
+def lit(buffers: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the buffers with color, diffuse and specular as irradiance and albedo make them."""
+    color = buffers["irradiance"] * buffers["albedo"]
+    return {**buffers, "color": color, "diffuse": 0.75 * color, "specular": 0.25 * color}
+
+
 def luminous(buffers: dict[str, Tensor], value: float) -> dict[str, Tensor]:
     """Return the buffers with constant irradiance."""
     return {**buffers, "irradiance": torch.full_like(buffers["irradiance"], value)}

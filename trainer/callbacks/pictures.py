@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from models.denoiser import Denoiser
-from trainer.modules.regression import noisy_input
+from trainer.modules.evaluation import noisy_input
 from trainer.reports.pictures import comparison
 from trainer.tracking import MLflowTracking
 

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from models.denoiser import Denoised, Denoiser, select
+from models.denoiser import Denoiser
 from trainer.losses import SMAPE
-from trainer.metrics.collection import METRICS, SceneMetrics
+from trainer.modules.evaluation import Batch, Evaluated
 from trainer.schedules import OneCycle
 
-Batch = dict[str, Any]
 
-
-class Regression(LightningModule):
+class Regression(Evaluated):
     """Minimise a loss between denoised and reference radiance.
 
     Loss and metrics see exposed radiance: radiance times the frame's `exposure`, so that scenes in different
@@ -42,29 +37,11 @@ class Regression(LightningModule):
         optimizer: Callable[[Iterable], Optimizer] = torch.optim.Adam,
         lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
     ) -> None:
-        super().__init__()
-        with warnings.catch_warnings():
-            # Lightning would rather not save modules; in a configuration they are class paths, which rebuild
-            # the network from the checkpoint alone.
-            warnings.filterwarnings("ignore", "Attribute '.*' is an instance of `nn.Module`")
-            self.save_hyperparameters()
-        self.net = net
+        super().__init__(net)
+        self.keep_arguments()
         self.loss = loss if loss is not None else SMAPE()
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
-        self.scores: SceneMetrics | None = None
-        self.input_scores: SceneMetrics | None = None
-
-    def forward(self, batch: Batch) -> Denoised:
-        """Denoise a batch of the data module."""
-        result = self.net(select(self.net, batch))
-        assert isinstance(result, Denoised)
-        return result
-
-    def exposed(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return exposed output and exposed reference, float32 (B, 3, H, W)."""
-        exposure = batch["exposure"].float().reshape(-1, 1, 1, 1)
-        return self(batch).color.float() * exposure, batch["reference"].float() * exposure
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of one batch."""
@@ -73,42 +50,10 @@ class Regression(LightningModule):
         self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=len(target))
         return loss
 
-    def on_validation_epoch_start(self) -> None:
-        """Start new sums."""
-        self.scores = self._new_scores("validation")
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score one batch of fixed crops."""
-        output, target = self.exposed(batch)
-        self.log("val/loss", self.loss(output, target), batch_size=len(target), sync_dist=True)
-        assert self.scores is not None
-        self.scores.update(output, target, batch["scene"])
-
-    def on_validation_epoch_end(self) -> None:
-        """Log the metrics of every scene and their average."""
-        assert self.scores is not None
-        self._log_table("val", self.scores.compute())
-
-    def on_test_epoch_start(self) -> None:
-        """Start new sums, for the output and for the noisy input beside it."""
-        self.scores = self._new_scores("test")
-        self.input_scores = self._new_scores("test")
-
-    def test_step(self, batch: Batch, batch_idx: int) -> None:
-        """Score whole frames, denoised and as they came."""
-        output, target = self.exposed(batch)
-        assert self.scores is not None
-        assert self.input_scores is not None
-        self.scores.update(output, target, batch["scene"])
-        exposure = batch["exposure"].float().reshape(-1, 1, 1, 1)
-        self.input_scores.update(noisy_input(self.net, batch) * exposure, target, batch["scene"])
-
-    def on_test_epoch_end(self) -> None:
-        """Log both tables."""
-        assert self.scores is not None
-        assert self.input_scores is not None
-        self._log_table("test", self.scores.compute())
-        self._log_table("input", self.input_scores.compute())
+    def validation_loss(self, batch: Batch, output: Tensor, target: Tensor) -> Tensor:
+        """Return the loss of exposed output and reference."""
+        loss: Tensor = self.loss(output, target)
+        return loss
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Return the optimiser, with its schedule if there is one."""
@@ -116,43 +61,7 @@ class Regression(LightningModule):
         if self.make_lr_scheduler is None:
             return optimizer
         schedule = self.make_lr_scheduler(optimizer)
-        interval = "epoch"
         if isinstance(schedule, OneCycle):
             schedule.span(int(self.trainer.estimated_stepping_batches))
-            interval = "step"
+        interval = getattr(schedule, "interval", "epoch")
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": interval}}
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep objects out of the checkpoint, so that it is read without pickle.
-
-        From a configuration the hyper-parameters are class paths, and the checkpoint alone rebuilds the
-        network; a module that was made in Python is loaded with `load_from_checkpoint(path, net=…)`.
-        """
-        saved = checkpoint.get("hyper_parameters", {})
-        checkpoint["hyper_parameters"] = {key: value for key, value in saved.items() if _is_plain(value)}
-
-    def _new_scores(self, split: str) -> SceneMetrics:
-        scenes = self.trainer.datamodule.scenes(split)  # type: ignore[attr-defined]
-        return SceneMetrics(scenes).to(self.device)
-
-    def _log_table(self, prefix: str, table: dict[str, dict[str, float]]) -> None:
-        # The sums were reduced over the ranks already; every rank logs the same numbers.
-        for scene, row in table.items():
-            for name in METRICS:
-                key = f"{prefix}/{name}" if scene == "average" else f"{prefix}/{name}/{scene}"
-                self.log(key, row[name], sync_dist=False, batch_size=1)
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, dict):
-        return all(_is_plain(item) for item in value.values())
-    if isinstance(value, list | tuple):
-        return all(_is_plain(item) for item in value)
-    return value is None or isinstance(value, str | int | float | bool)
-
-
-def noisy_input(net: Denoiser, batch: Batch) -> Tensor:
-    """Return the radiance (B, 3, H, W) that a denoiser starts from: accumulated where it uses that."""
-    if "irradiance" in net.inputs:
-        return batch["irradiance"].float() * batch["albedo"].float()
-    return batch["color"].float()
