@@ -3,7 +3,18 @@ import pytest
 import torch
 
 from trainer.metrics.collection import METRICS, SceneMetrics
-from trainer.metrics.functional import psnr_wskp, relmse_layer, smape_wskp, ssim_wskp, ssim_wskp_range1
+from trainer.metrics.functional import (
+    levels,
+    psnr_afgsa,
+    psnr_wskp,
+    rel_mse_half_afgsa,
+    relmse_layer,
+    smape_wskp,
+    ssim_afgsa,
+    ssim_wskp,
+    ssim_wskp_range1,
+)
+from trainer.reports.tables import print_scores
 
 
 def pair(seed=0, size=(2, 3, 20, 23)):
@@ -91,3 +102,92 @@ def test_sums_of_two_ranks_reduce_to_the_result_of_one():
 def test_unknown_scene_is_named():
     with pytest.raises(ValueError, match="kitchen"):
         SceneMetrics(["a"]).update(*pair(size=(1, 3, 8, 8)), ["kitchen"])
+
+
+def eight_bit(image):
+    """What AFGSA's authors evaluate, by numpy: gamma 1/2.2, clipped, times 255, cut off to uint8."""
+    return (np.clip(np.maximum(image.double().numpy(), 0) ** (1 / 2.2), 0, 1) * 255).astype(np.uint8)
+
+
+def gaussian_ssim(x, y):
+    """One 11x11 window at a time, float64, weighted by a Gaussian of 1.5 pixels."""
+    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    rows, columns = np.mgrid[-5:6, -5:6]
+    weights = np.exp(-(rows**2 + columns**2) / (2 * 1.5**2))
+    weights /= weights.sum()
+    values = []
+    for channel in range(3):
+        for row in range(x.shape[1] - 10):
+            for column in range(x.shape[2] - 10):
+                a = x[channel, row : row + 11, column : column + 11].astype(np.float64)
+                b = y[channel, row : row + 11, column : column + 11].astype(np.float64)
+                ma, mb = (weights * a).sum(), (weights * b).sum()
+                va, vb = (weights * (a - ma) ** 2).sum(), (weights * (b - mb) ** 2).sum()
+                covariance = (weights * (a - ma) * (b - mb)).sum()
+                mean = (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
+                values.append(mean * (2 * covariance + c2) / (va + vb + c2))
+    return np.mean(values)
+
+
+def test_ssim_of_afgsa_equals_a_window_by_window_transcription_on_8_bit_images():
+    output, reference = pair(3)
+    pairs = zip(output, reference, strict=True)
+    expected = [gaussian_ssim(eight_bit(o), eight_bit(r)) for o, r in pairs]
+    assert ssim_afgsa(output, reference).numpy() == pytest.approx(expected, abs=1e-6)
+
+
+def test_psnr_of_afgsa_is_on_8_bit_images():
+    output, reference = pair(4)
+    for o, r, found in zip(output, reference, psnr_afgsa(output, reference), strict=True):
+        error = np.mean((eight_bit(o).astype(np.float64) - eight_bit(r)) ** 2)
+        assert float(found) == pytest.approx(20 * np.log10(255 / np.sqrt(error)), abs=1e-5)
+
+
+def test_levels_are_cut_off_and_not_rounded():
+    image = torch.tensor([-1.0, 0.0, (100.99 / 255) ** 2.2, (100.01 / 255) ** 2.2, 1.0, 7.0])
+    assert levels(image).tolist() == [0, 0, 100, 100, 255, 255]
+
+
+def test_psnr_of_afgsa_is_zero_where_images_are_equal_and_48_db_at_one_level():
+    image = torch.full((1, 3, 16, 16), (100.5 / 255) ** 2.2)
+    assert float(psnr_afgsa(image, image)) == 0.0
+    assert float(psnr_afgsa(image, image, equal=99.0)) == 99.0
+    assert float(ssim_afgsa(image, image)) == pytest.approx(1.0)
+    brighter = torch.full_like(image, (101.5 / 255) ** 2.2)
+    assert float(psnr_afgsa(brighter, image)) == pytest.approx(20 * np.log10(255), abs=1e-4)
+
+
+def test_the_error_that_afgsa_calls_rmse_is_half_a_relative_square_with_its_own_eps():
+    output, reference = torch.full((1, 3, 8, 8), 0.5), torch.full((1, 3, 8, 8), 0.3)
+    assert float(rel_mse_half_afgsa(output, reference)) == pytest.approx(0.5 * 0.04 / 0.1, rel=1e-5)
+    assert float(rel_mse_half_afgsa(output, reference, eps=0.07)) == pytest.approx(0.5 * 0.25, rel=1e-5)
+
+
+def test_ssim_of_afgsa_refuses_an_image_smaller_than_its_window():
+    with pytest.raises(ValueError, match="11x11"):
+        ssim_afgsa(torch.ones(1, 3, 10, 20), torch.ones(1, 3, 10, 20))
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_every_metric_says_which_direction_is_better(name):
+    output, reference = pair(5)
+    closer = reference + 0.25 * (output - reference)
+    better, worse = (METRICS[name].function(image, reference).mean() for image in (closer, output))
+    assert (better > worse) == METRICS[name].higher
+
+
+def test_both_tables_fit_a_hundred_columns_and_say_how_metrics_are_defined(capsys):
+    scenes = ("average", "sponza-moving-light")
+    logged = {
+        f"{kind}/{name}{'' if scene == 'average' else '/' + scene}": 12.3456789
+        for kind in ("test", "input")
+        for name in METRICS
+        for scene in scenes
+    }
+    print_scores(logged, "test")
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 100
+    assert sum("sponza-moving-light" in line for line in lines) == 4
+    assert sum(line.count("12.35 dB") for line in lines) == 8
+    assert sum(line.startswith("Definitions:") for line in lines) == 2
+    assert "…" not in "".join(lines)

@@ -3,24 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from trainer.metrics.functional import psnr_wskp, relmse_layer, smape_wskp, ssim_wskp, ssim_wskp_range1
+from trainer.metrics import functional
 
-METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "psnr_wskp": psnr_wskp,
-    "ssim_wskp": ssim_wskp,
-    "ssim_wskp_range1": ssim_wskp_range1,
-    "relmse_layer": relmse_layer,
-    "smape_wskp": smape_wskp,
+
+@dataclass(frozen=True)
+class Measure:
+    """A metric as it is logged and tabulated.
+
+    Attributes:
+        function: Called with exposed output and reference (B, 3, H, W); returns (B,).
+        higher: Larger is better.
+        format: How a value is printed.
+        source: Whose tables it belongs to, a key of `SOURCES`.
+    """
+
+    function: Callable[[Tensor, Tensor], Tensor]
+    higher: bool
+    format: str
+    source: Literal["wskp", "afgsa"]
+
+
+METRICS: dict[str, Measure] = {
+    "psnr_wskp": Measure(functional.psnr_wskp, True, "{:.2f} dB", "wskp"),
+    "ssim_wskp": Measure(functional.ssim_wskp, True, "{:.4f}", "wskp"),
+    "ssim_wskp_range1": Measure(functional.ssim_wskp_range1, True, "{:.4f}", "wskp"),
+    "relmse_layer": Measure(functional.relmse_layer, False, "{:.4f}", "wskp"),
+    "smape_wskp": Measure(functional.smape_wskp, False, "{:.4f}", "wskp"),
+    "psnr_afgsa": Measure(functional.psnr_afgsa, True, "{:.2f} dB", "afgsa"),
+    "ssim_afgsa": Measure(functional.ssim_afgsa, True, "{:.4f}", "afgsa"),
+    "rel_mse_half_afgsa": Measure(functional.rel_mse_half_afgsa, False, "{:.6f}", "afgsa"),
 }
-"""Name in tables and logs → function of exposed output and reference."""
+"""Name in tables and logs → the metric."""
 
-HIGHER_IS_BETTER = {"psnr_wskp": True, "ssim_wskp": True, "ssim_wskp_range1": True, "relmse_layer": False,
-                    "smape_wskp": False}  # fmt: skip
+SOURCES: dict[str, str] = {
+    "wskp": "PSNR and SSIM on clamp(max(x, 0)^0.454545, 0, 1) of exposed radiance; ssim_wskp uses data range "
+    "2 like the published tables, ssim_wskp_range1 uses 1; relmse_layer: mean (o - r)^2 / (r^2 + 1e-4); "
+    "smape_wskp: mean |o - r| / (|o| + |r| + 0.01).",
+    "afgsa": "as AFGSA and ACFM print them: PSNR and SSIM (Gaussian 11x11 window, range 255) on 8-bit images "
+    "of exposed radiance, clamp(x^(1/2.2), 0, 1) * 255 truncated; rel_mse_half_afgsa: "
+    '0.5 mean (o - r)^2 / (r^2 + 0.01), their "RMSE".',
+}
+"""Group of metrics → how they are defined."""
 
 
 class SceneMetrics(Metric):
@@ -52,7 +82,7 @@ class SceneMetrics(Metric):
         unknown = set(scenes) - set(self.scenes)
         if unknown:
             raise ValueError(f"scene {', '.join(sorted(unknown))} is not among {', '.join(self.scenes)}")
-        values = torch.stack([metric(output, reference) for metric in METRICS.values()], dim=1)
+        values = torch.stack([m.function(output, reference) for m in METRICS.values()], dim=1)
         for row, scene in enumerate(scenes):
             place = self.scenes.index(scene)
             self.totals[place] += values[row].to(self.totals)

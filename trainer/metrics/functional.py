@@ -2,7 +2,7 @@
 
 Every function takes linear radiance (B, 3, H, W), already multiplied by the exposure at which it is to be
 judged, and returns one float32 number per image (B,). The transfer "gamma" of WSKP, NBGD and MR-KP is
-`clamp(max(x, 0) ** 0.454545, 0, 1)`.
+`clamp(max(x, 0) ** 0.454545, 0, 1)`; AFGSA and ACFM evaluate 8-bit images (`levels`).
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ def ssim_wskp(output: Tensor, reference: Tensor, data_range: float = 2.0) -> Ten
         ValueError: The image is smaller than the window.
     """
     size = 7
-    if min(output.shape[-2:]) < size:
-        raise ValueError(f"SSIM needs at least {size}x{size} pixels, got {tuple(output.shape[-2:])}")
+    _check_window(output, size)
     x, y = gamma(output).double(), gamma(reference).double()
     unbiased = size * size / (size * size - 1)
 
@@ -48,9 +47,7 @@ def ssim_wskp(output: Tensor, reference: Tensor, data_range: float = 2.0) -> Ten
     vx = unbiased * (mean(x * x) - mx * mx)
     vy = unbiased * (mean(y * y) - my * my)
     vxy = unbiased * (mean(x * y) - mx * my)
-    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
-    similarity = ((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return similarity.flatten(1).mean(1).float()
+    return _similarity(mx, my, vx, vy, vxy, data_range)
 
 
 def ssim_wskp_range1(output: Tensor, reference: Tensor) -> Tensor:
@@ -69,3 +66,85 @@ def smape_wskp(output: Tensor, reference: Tensor) -> Tensor:
     output, reference = output.float(), reference.float()
     scale = output.abs() + reference.abs() + 0.01
     return ((output - reference).abs() / scale).flatten(1).mean(1)
+
+
+def rel_mse_half_afgsa(output: Tensor, reference: Tensor, eps: float = 0.01) -> Tensor:
+    """What AFGSA and ACFM print as "RMSE": `0.5 mean (o - r)^2 / (r^2 + eps)`, on linear radiance.
+
+    Neither the half nor eps is in the papers; both are in the authors' code. Tables show it times 1000.
+    """
+    output, reference = output.float(), reference.float()
+    relative = torch.square(output - reference) / (torch.square(reference) + eps)
+    return 0.5 * relative.flatten(1).mean(1)
+
+
+def levels(radiance: Tensor, exponent: float = 2.2, peak: int = 255) -> Tensor:
+    """Return the 8-bit image that AFGSA evaluates: `clamp(x^(1/2.2), 0, 1) * 255`, truncated, float64."""
+    display = radiance.double().clamp_min(0).pow(1 / exponent).clamp_max(1)
+    return torch.floor(display * peak)
+
+
+def psnr_afgsa(output: Tensor, reference: Tensor, exponent: float = 2.2, equal: float = 0.0) -> Tensor:
+    """Peak signal-to-noise ratio in dB as in AFGSA and ACFM: `20 log10(255 / RMSE)` of 8-bit images.
+
+    Args:
+        output: Exposed radiance.
+        reference: What it should be.
+        exponent: Of the transfer to display values; these are truncated to whole levels, not rounded.
+        equal: What equal images have; the authors' code returns 0 where the ratio is infinite.
+    """
+    error = torch.square(levels(output, exponent) - levels(reference, exponent)).flatten(1).mean(1)
+    ratio = 20 * torch.log10(255 / error.sqrt())
+    return torch.where(error == 0, torch.full_like(ratio, equal), ratio).float()
+
+
+def ssim_afgsa(
+    output: Tensor,
+    reference: Tensor,
+    exponent: float = 2.2,
+    size: int = 11,
+    sigma: float = 1.5,
+    data_range: float = 255.0,
+) -> Tensor:
+    """Structural similarity as in AFGSA and ACFM: their 8-bit images, Gaussian window, biased variances.
+
+    Mean over RGB and over the windows that lie inside the image (Wang et al. 2004, eq. 13). The papers print
+    1 - SSIM.
+
+    Args:
+        output: Exposed radiance.
+        reference: What it should be.
+        exponent: Of the transfer to display values.
+        size: Side of the window.
+        sigma: Standard deviation of the window in pixels.
+        data_range: Largest difference of two display values.
+
+    Raises:
+        ValueError: The image is smaller than the window.
+    """
+    _check_window(output, size)
+    x, y = levels(output, exponent), levels(reference, exponent)
+    offsets = torch.arange(size, dtype=torch.float64, device=x.device) - (size - 1) / 2
+    window = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
+    window = (window / window.sum()).repeat(3, 1, 1, 1)
+
+    def mean(image: Tensor) -> Tensor:
+        rows = F.conv2d(image, window.swapaxes(2, 3), groups=3)
+        return F.conv2d(rows, window, groups=3)
+
+    mx, my = mean(x), mean(y)
+    vx, vy = mean(x * x) - mx * mx, mean(y * y) - my * my
+    vxy = mean(x * y) - mx * my
+    return _similarity(mx, my, vx, vy, vxy, data_range)
+
+
+def _check_window(image: Tensor, size: int) -> None:
+    if min(image.shape[-2:]) < size:
+        raise ValueError(f"SSIM needs at least {size}x{size} pixels, got {tuple(image.shape[-2:])}")
+
+
+def _similarity(mx: Tensor, my: Tensor, vx: Tensor, vy: Tensor, vxy: Tensor, data_range: float) -> Tensor:
+    """Return the mean similarity per image from windows' means, variances and covariance."""
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    similarity = ((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return similarity.flatten(1).mean(1).float()

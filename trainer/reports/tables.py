@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,10 +10,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from trainer.metrics.collection import HIGHER_IS_BETTER, METRICS
+from trainer.metrics.collection import METRICS, SOURCES
 
-FORMATS = {"psnr_wskp": "{:.2f} dB", "ssim_wskp": "{:.4f}", "ssim_wskp_range1": "{:.4f}",
-           "relmse_layer": "{:.4f}", "smape_wskp": "{:.4f}"}  # fmt: skip
+TITLES = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
 
 
 def scores_by_scene(logged: Mapping[str, Any], prefix: str) -> dict[str, dict[str, float]]:
@@ -26,34 +26,39 @@ def scores_by_scene(logged: Mapping[str, Any], prefix: str) -> dict[str, dict[st
     return {**dict(sorted(table.items())), **({"average": average} if average else {})}
 
 
-def scores_table(logged: Mapping[str, Any], prefix: str) -> Table:
-    """Return a table with one row per scene and method: the noisy input and the denoised frames."""
-    titles = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
-    table = Table(
-        title=titles.get(prefix, prefix), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
+def scores_table(logged: Mapping[str, Any], prefix: str, source: str = "wskp") -> Table:
+    """Return a table with one row per scene and method: the noisy input and the denoised frames.
+
+    Args:
+        logged: What was logged.
+        prefix: `test` or `val`.
+        source: Whose metrics, a key of `SOURCES`.
+    """
+    metrics = {name: metric for name, metric in METRICS.items() if metric.source == source}
+    title = TITLES.get(prefix, prefix)
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("scene", no_wrap=True)
     table.add_column("image", no_wrap=True)
-    for name, higher in HIGHER_IS_BETTER.items():
+    for name, metric in metrics.items():
         # "ssim_wskp_range1" is the widest name; two lines keep the table within 90 columns.
-        title = name.replace("_range1", "\n_range1") if "_range1" in name else f"{name}\n"
-        table.add_column(f"{title} {'↑' if higher else '↓'}", justify="right", no_wrap=True)
+        heading = name.replace("_range1", "\n_range1") if "_range1" in name else f"{name}\n"
+        table.add_column(f"{heading} {'↑' if metric.higher else '↓'}", justify="right", no_wrap=True)
     denoised = scores_by_scene(logged, prefix)
     noisy = scores_by_scene(logged, "input") if prefix == "test" else {}
     for scene, row in denoised.items():
         for label, values in (("input", noisy.get(scene)), ("denoised", row)):
             if values is not None:
-                cells = [FORMATS[name].format(values[name]) for name in METRICS]
+                cells = [metric.format.format(values[name]) for name, metric in metrics.items()]
                 table.add_row(scene, label, *cells, style="bold" if label == "denoised" else "dim")
         table.add_section()
     return table
 
 
 def print_scores(logged: Mapping[str, Any], prefix: str) -> None:
-    """Print the table of metrics per scene and averaged."""
+    """Print the metrics per scene and averaged: one table for each group, with its definitions."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=100)  # a pipe has no width; narrower columns would be cut
-    console.print(scores_table(logged, prefix))
-    print("Definitions: PSNR and SSIM on clamp(max(x, 0)^0.454545, 0, 1) of exposed radiance;")
-    print("ssim_wskp uses data range 2 like the published tables, ssim_wskp_range1 uses 1.")
+    for source, definition in SOURCES.items():
+        console.print(scores_table(logged, prefix, source))
+        print(textwrap.fill(f"Definitions: {definition}", 100))
