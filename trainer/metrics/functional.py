@@ -124,18 +124,21 @@ def ssim_afgsa(
     """
     _check_window(output, size)
     x, y = levels(output, exponent), levels(reference, exponent)
-    offsets = torch.arange(size, dtype=torch.float64, device=x.device) - (size - 1) / 2
-    window = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
-    window = (window / window.sum()).repeat(3, 1, 1, 1)
+    offsets = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+    weights = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
+    weights = weights / weights.sum()
+    maps = torch.stack([x, y, x * x, y * y, x * y])
+    mx, my, mxx, myy, mxy = _weighted(_weighted(maps, weights.tolist(), -1), weights.tolist(), -2)
+    return _similarity(mx, my, mxx - mx * mx, myy - my * my, mxy - mx * my, data_range)
 
-    def mean(image: Tensor) -> Tensor:
-        rows = F.conv2d(image, window.swapaxes(2, 3), groups=3)
-        return F.conv2d(rows, window, groups=3)
 
-    mx, my = mean(x), mean(y)
-    vx, vy = mean(x * x) - mx * mx, mean(y * y) - my * my
-    vxy = mean(x * y) - mx * my
-    return _similarity(mx, my, vx, vy, vxy, data_range)
+def _weighted(maps: Tensor, weights: list[float], axis: int) -> Tensor:
+    """Return weighted sums of successive rows or columns; no convolution, which autocast would round."""
+    length = maps.shape[axis] - len(weights) + 1
+    total = maps.narrow(axis, 0, length) * weights[0]
+    for place, weight in enumerate(weights[1:], 1):
+        total.add_(maps.narrow(axis, place, length), alpha=weight)
+    return total
 
 
 def _check_window(image: Tensor, size: int) -> None:
