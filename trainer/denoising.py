@@ -1,7 +1,7 @@
 """Frames in, denoised frames out: what `trainer denoise` does to each frame of a clip.
 
 Derive what is missing, choose the exposure, accumulate where the model was trained so, denoise in tiles that
-fit the memory budget.
+fit the memory budget. On request the attention of one pixel is looked at as well.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from data.frame import Frame, Image
 from data.temporal import Accumulator
 from models.denoiser import Denoiser
 from models.tiling import denoise_tiled
+from trainer.attention import Attention, attention_of, attentive, inside
 from trainer.clips import Clip
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.loading import Loaded
@@ -35,6 +36,7 @@ class Settings:
         accumulate: Accumulate sequences where the model expects it.
         memory: Bytes that one call of the model may take; larger images are tiled.
         device: Where to run.
+        attention: Column and row of the pixel whose attention is wanted.
     """
 
     exposure: float | None = None
@@ -42,6 +44,7 @@ class Settings:
     accumulate: bool = True
     memory: int = 2 * 1024**3
     device: str = "cpu"
+    attention: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Result:
         noisy: Radiance of the frame alone (H, W, 3).
         accumulated: Radiance accumulated over the preceding frames, None where that was not done.
         reference: Converged radiance, None where the frame has none.
+        attention: Of the pixel that the settings name, None where they name none.
     """
 
     frame: Frame
@@ -61,6 +65,7 @@ class Result:
     noisy: Image
     accumulated: Image | None
     reference: Image | None
+    attention: Attention | None = None
 
 
 def replaced_pixels(frame: Frame) -> str | None:
@@ -94,11 +99,16 @@ class ClipDenoiser:
         clip: Whose frames will come.
         settings: How.
         say: Called with each remark for the user; the caller may show each only once.
+
+    Raises:
+        ValueError: Attention is wanted and the model has none to look at.
     """
 
     def __init__(self, loaded: Loaded, clip: Clip, settings: Settings, say: Callable[[str], None]) -> None:
         self.loaded = loaded
         self.model = loaded.model.deploy().eval()
+        if settings.attention is not None:
+            attentive(loaded.model, loaded.source.reference)
         self.clip = clip
         self.settings = settings
         self.say = say
@@ -110,8 +120,11 @@ class ClipDenoiser:
         """Denoise the next frame.
 
         Raises:
-            ValueError: A buffer is missing and cannot be derived, or the model returned NaN or Inf.
+            ValueError: A buffer is missing and cannot be derived, the pixel whose attention is wanted lies
+                outside of the frame, or the model returned NaN or Inf.
         """
+        if self.settings.attention is not None:
+            inside(self.settings.attention, frame.width, frame.height)
         follows = self._follows(frame)
         previous = self._last.camera if follows and self._last is not None else None
         frame.notes["sequence"] = self.clip.sequence
@@ -120,7 +133,10 @@ class ClipDenoiser:
         self._last = frame
         noisy = self._noisy(frame)
         frame = self._accumulated(frame)
-        color = self._denoise(frame, exposure)
+        buffers = self._tensors(frame, exposure)
+        with torch.inference_mode():
+            denoised = denoise_tiled(self.model, buffers, budget=self.settings.memory)
+        color = np.ascontiguousarray(denoised[0].float().cpu().numpy().transpose(1, 2, 0))
         if not np.isfinite(color).all():
             raise ValueError(
                 f"{frame.label}: the model returned NaN or Inf; train it again or report the frame"
@@ -138,6 +154,7 @@ class ClipDenoiser:
             noisy,
             self._noisy(frame) if frame.accumulated else None,
             frame.buffers.get("reference"),
+            self._attention(buffers),
         )
 
     def _follows(self, frame: Frame) -> bool:
@@ -196,7 +213,7 @@ class ClipDenoiser:
             return frame.buffers["irradiance"] * frame.buffers["albedo"]
         return derive(frame, ["color"]).buffers["color"]
 
-    def _denoise(self, frame: Frame, exposure: float) -> Image:
+    def _tensors(self, frame: Frame, exposure: float) -> dict[str, Tensor]:
         frame.require(*self.model.inputs)
         buffers: dict[str, Tensor] = {
             name: torch.from_numpy(np.ascontiguousarray(frame.buffers[name].transpose(2, 0, 1)))[None]
@@ -205,9 +222,13 @@ class ClipDenoiser:
         buffers = {name: value.to(self.settings.device) for name, value in buffers.items()}
         if "exposure" in self.model.frame_numbers:
             buffers["exposure"] = torch.tensor([exposure], dtype=torch.float32, device=self.settings.device)
-        with torch.inference_mode():
-            color = denoise_tiled(self.model, buffers, budget=self.settings.memory)
-        return np.ascontiguousarray(color[0].float().cpu().numpy().transpose(1, 2, 0))
+        return buffers
+
+    def _attention(self, buffers: dict[str, Tensor]) -> Attention | None:
+        if self.settings.attention is None:
+            return None
+        model = attentive(self.loaded.model, self.loaded.source.reference)
+        return attention_of(model, buffers, self.settings.attention)
 
     def _provenance(self, exposure: float) -> dict[str, Any]:
         model = self.loaded.model

@@ -9,10 +9,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
     from trainer.clips import Item
     from trainer.denoising import Result
 
@@ -39,6 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the results")
     parser.add_argument(
         "--png", action="store_true", help="also write tone-mapped pictures, and comparisons with a reference"
+    )
+    parser.add_argument(
+        "--attention",
+        type=_pixel,
+        metavar="X,Y",
+        help="with --png: also picture where a network with attention (AFGSA) looks for the pixel in "
+        "column X and row Y, counted from 0 at the upper left",
     )
     parser.add_argument(
         "--split", choices=("train", "validation", "test"), help="only these scenes of a data set"
@@ -69,9 +79,14 @@ def run(args: argparse.Namespace) -> int:
     """Denoise everything that was named; returns the exit code.
 
     Raises:
+        UsageError: Options do not go together.
         ValueError: An input, option or frame is wrong; frames that were finished before stay.
         OSError: A file cannot be read or written.
     """
+    from trainer.configs import UsageError
+
+    if args.attention is not None and not args.png:
+        raise UsageError("--attention draws a picture: expected --png with it")
     from trainer.clips import find_clips
     from trainer.denoising import ClipDenoiser, Settings, replaced_pixels
     from trainer.loading import resolve
@@ -80,13 +95,16 @@ def run(args: argparse.Namespace) -> int:
     _check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
-    outputs = [path for item in items for path in _outputs(args.output, item, args.png)]
+    wanted = _Wanted(args.output, args.png, args.attention is not None)
+    outputs = [path for item in items for path in wanted.paths(item).values()]
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
     make_folder(args.output)
     loaded = resolve(args.model, args.device)
     number = args.exposure if isinstance(args.exposure, float) else None
-    settings = Settings(number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device)
+    settings = Settings(
+        number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device, args.attention
+    )
     with _progress(len(items)) as progress:
         for clip in clips:
             denoiser = ClipDenoiser(loaded, clip, settings, progress.say)
@@ -96,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
                     if replaced := replaced_pixels(frame):
                         progress.say(f"{item.label}: {replaced}")
                     result = denoiser.step(frame)
-                _write(result, args.output, item, args.png)
+                _write(result, wanted.paths(item))
                 progress.advance(item)
     print(
         f"{len(items)} frame{'s' * (len(items) != 1)} written to {args.output} ({progress.rate})",
@@ -117,6 +135,15 @@ def _exposure(text: str) -> float | str:
     return value
 
 
+def _pixel(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+),(\d+)", "".join(text.split()))
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no pixel; expected its column and row, such as 120,64, counted from 0"
+        )
+    return int(match[1]), int(match[2])
+
+
 def _bytes(text: str) -> int:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmg]?i?)b?", text.strip().lower())
     if match is None or match[2] not in _UNITS or not float(match[1]) > 0:
@@ -126,9 +153,22 @@ def _bytes(text: str) -> int:
     return int(float(match[1]) * _UNITS[match[2]])
 
 
-def _outputs(folder: Path, item: Item, png: bool) -> list[Path]:
-    suffixes = (".exr", ".png", "_comparison.png") if png else (".exr",)
-    return [folder / f"{item.name}{suffix}" for suffix in suffixes]
+@dataclass(frozen=True)
+class _Wanted:
+    """Which results are written, and where."""
+
+    folder: Path
+    png: bool
+    attention: bool
+
+    def paths(self, item: Item) -> dict[str, Path]:
+        """Return the files of a frame by what they show; those of pictures only where they are wanted."""
+        suffixes = {"exr": ".exr"}
+        if self.png:
+            suffixes |= {"denoised": ".png", "comparison": "_comparison.png"}
+        if self.attention:
+            suffixes["attention"] = "_attention.png"
+        return {kind: self.folder / f"{item.name}{suffix}" for kind, suffix in suffixes.items()}
 
 
 def _refuse_inputs(items: list[Item], outputs: list[Path]) -> None:
@@ -173,25 +213,33 @@ def _naming(item: Item, say: Callable[[str], None]) -> Iterator[None]:
         say(str(warning.message))
 
 
-def _write(result: Result, folder: Path, item: Item, png: bool) -> None:
+def _write(result: Result, paths: dict[str, Path]) -> None:
     from data.exr import write_frame
     from trainer.outputs import replacing
+
+    exr = paths["exr"]
+    exr.parent.mkdir(parents=True, exist_ok=True)
+    pictures = _pictures(result) if "denoised" in paths else {}
+    for kind, image in pictures.items():
+        with replacing(paths[kind]) as temporary:
+            image.save(temporary)
+    write_frame(result.frame, exr)  # last: a frame with its EXR is finished
+
+
+def _pictures(result: Result) -> dict[str, Picture]:
+    from trainer.reports.attention import attention_picture
     from trainer.reports.pictures import comparison, tone_map
 
-    exr, *pictures = _outputs(folder, item, png)
-    exr.parent.mkdir(parents=True, exist_ok=True)
-    color = result.frame.buffers["color"]
-    if png:
-        images = [tone_map(color, result.exposure)]
-        if result.reference is not None:
-            title = f"{result.frame.label}, exposure {result.exposure:.4g}"
-            images.append(
-                comparison(result.noisy, result.accumulated, color, result.reference, result.exposure, title)
-            )
-        for path, image in zip(pictures, images, strict=False):
-            with replacing(path) as temporary:
-                image.save(temporary)
-    write_frame(result.frame, exr)  # last: a frame with its EXR is finished
+    color, exposure, label = result.frame.buffers["color"], result.exposure, result.frame.label
+    pictures = {"denoised": tone_map(color, exposure)}
+    if result.reference is not None:
+        title = f"{label}, exposure {exposure:.4g}"
+        pictures["comparison"] = comparison(
+            result.noisy, result.accumulated, color, result.reference, exposure, title
+        )
+    if result.attention is not None:
+        pictures["attention"] = attention_picture(color, exposure, result.attention, label)
+    return pictures
 
 
 class _Progress:
