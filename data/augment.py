@@ -22,10 +22,13 @@ Array = NDArray[np.float32]
 WORLD_VECTORS = frozenset({"normal", "normal_a", "normal_b", "position", "position_a", "position_b"})
 """Vectors in world space, which turn with the axes of the world."""
 
+WORLD_VARIANCES = frozenset({"normal_variance", "position_variance"})
+"""Variances of their coordinates, which have no sign."""
+
 ORDERS = tuple(permutations(range(3)))
 """The six orders of three channels; the first leaves them."""
 
-IMAGE_PLANE = frozenset({"motion", "motion_a", "motion_b"})
+IMAGE_PLANE = frozenset({"motion", "motion_a", "motion_b", "motion_variance"})
 """Vectors (x to the right, y down) that turn with the image. Normals are in world space and stay."""
 
 
@@ -159,15 +162,22 @@ def reordered(image: Array, name: str, change: Change) -> Array:
     """Return an image (C, H, W) whose channels are in the changed order; the same array if none changes."""
     if name in WORLD_VECTORS and (change.axes != ORDERS[0] or min(change.signs) < 0):
         return image[list(change.axes)] * np.asarray(change.signs, np.float32)[:, None, None]
+    if name in WORLD_VARIANCES and change.axes != ORDERS[0]:
+        return image[list(change.axes)]
     if change.colors != ORDERS[0] and buffer(name).letters == "RGB":
         return image[list(change.colors)]
     return image
 
 
-def turn_vectors(image: Array, turn: Turn) -> None:
-    """Turn the values of image-plane vectors (2, H, W), in place; `turned` moves their pixels."""
+def turn_vectors(image: Array, turn: Turn, name: str = "motion") -> None:
+    """Turn the values of image-plane vectors (2, H, W), in place; `turned` moves their pixels.
+
+    Variances of the coordinates change places with them, but have no sign.
+    """
     if turn & Turn.TRANSPOSE:
         image[:] = image[::-1].copy()
+    if buffer(name).kind == "variance":
+        return
     if turn & Turn.FLIP_X:
         np.negative(image[0], out=image[0])
     if turn & Turn.FLIP_Y:

@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from data.buffers import buffer
 from data.derive import derive, sources
 from data.exr import StoredFrame, read_frame, read_stored
@@ -47,6 +49,19 @@ class FrameSet:
         if scene not in self.manifest.scenes:
             raise ValueError(f"{self.root} has no scene {scene!r}; scenes: {', '.join(self.manifest.scenes)}")
         return list(self.manifest.scenes[scene].frames)
+
+    def lacking(self, names: Collection[str]) -> tuple[FrameRecord, list[str]] | None:
+        """Return the first frame that neither holds some of these buffers nor lets derive them, and which.
+
+        Only the manifest is looked at; None where every frame has them all.
+        """
+        seen: set[frozenset[str]] = set()
+        for record in (record for scene in self.scenes() for record in self.frames(scene)):
+            has = frozenset((*record.buffers, *record.derived))
+            if has not in seen and (missing := [name for name in names if not _follows(name, has)]):
+                return record, missing
+            seen.add(has)
+        return None
 
     def read(
         self, scene: str, index: int, names: Iterable[str] | None = None, *, verify: bool = True
@@ -175,3 +190,13 @@ def derivable(frame: Frame) -> list[str]:
         "depth": "position" in has and frame.camera is not None,
     }
     return [name for name in DERIVED if name in has or found[name]]
+
+
+def _follows(name: str, has: Collection[str]) -> bool:
+    """Return whether a buffer can be derived from others: whether it is, for a frame of one pixel."""
+    pixel = Frame({other: np.ones((1, 1, buffer(other).channels), np.float32) for other in has}, "", 0)
+    try:
+        derive(pixel, [name])
+    except ValueError:
+        return False
+    return True

@@ -9,9 +9,10 @@ from lightning.pytorch import LightningDataModule
 
 from data.augment import Augmentation, Rule
 from data.buffers import buffer
+from data.frames import FrameSet
 from data.manifest import load_manifest
-from data.root import SAMPLE, resolve_root
-from data.sample import TRAIN_PATCHES
+from data.needs import beside, explain_lacking, patch_number
+from data.root import resolve_root
 from data.shards.batch import Batches, available
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
@@ -46,9 +47,10 @@ class Shards(LightningDataModule):
         exposure_stops: Vary the exposure of training patches by up to so many stops up and down.
         permute: Permute colour channels and world axes of training patches.
         drop_history: Share of training patches whose input is not accumulated.
-        train_patches: Training patches per 1280x720 frame, where the root is prepared here; None: as the
-            recipe says, 80 as in WSKP without one, and for a sample, whose frames are few and small,
-            `data.sample.TRAIN_PATCHES`.
+        train_patches: Training patches per 1280x720 frame, where the root is prepared here; with the recipe
+            `afgsa` the candidates, of which about two thirds are kept. None: as the recipe says, 80 as in
+            WSKP without one; for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES` or
+            `data.sample.CANDIDATES`.
         validation_patches: Validation patches per 1280x720 frame, where the root is prepared here; None: as
             the recipe says, 20 without one.
         patch_size: Width and height of patches, where the root is prepared here.
@@ -104,19 +106,14 @@ class Shards(LightningDataModule):
             if augment
             else Augmentation("none", seed=seed)
         )
-        if train_patches is None and recipe is None and root.startswith(SAMPLE):
-            train_patches = TRAIN_PATCHES
-        usual = recipe_options(recipe, {}).stored
         self.targets = tuple(dict.fromkeys(("reference", *targets)))
-        made = (*usual, "color", "irradiance", SAMPLES)  # one of the two follows from the other in a batch
-        beside = [name for name in (*(buffers or ()), *self.targets) if name not in made]
         explicit = {
             "patch_size": patch_size,
-            "train_patches": train_patches,
             "validation_patches": validation_patches,
             "seed": seed,
             "spp": None if spp is None else tuple(spp),
-            "buffers": tuple(dict.fromkeys(beside)) or None,
+            "buffers": beside(recipe, (*(buffers or ()), *self.targets)) or None,
+            **patch_number(root, recipe, train_patches),
         }
         self.options = recipe_options(recipe, explicit)
         self.on_corrupt, self.verify = on_corrupt, verify
@@ -164,9 +161,15 @@ class Shards(LightningDataModule):
         return {name: why for loader in self._loaders.values() for name, why in loader.corrupt.items()}
 
     def prepare_data(self) -> None:
-        """Prepare an ingested root into the cache, in one process per node."""
+        """Prepare an ingested root into the cache, in one process per node.
+
+        Raises:
+            ValueError: A frame lacks a buffer that the network reads or is compared with.
+        """
         found = resolve_root(self.root)
         if found.kind == "frames":
+            if lacking := FrameSet(found.path).lacking(self.options.buffers):
+                raise ValueError(explain_lacking(self._reader(), found.path, *lacking))
             prepare_cached(found.path, self.options, LineProgress(f"preparing {found.path.name}"))
 
     def setup(self, stage: str) -> None:
@@ -213,6 +216,11 @@ class Shards(LightningDataModule):
         """End the worker processes."""
         for loader in self._loaders.values():
             loader.close()
+
+    def _reader(self) -> str:
+        """Return what to call whoever reads the batches, in messages."""
+        net = getattr(getattr(self.trainer, "lightning_module", None), "net", None)
+        return "the network" if net is None else type(net).__name__
 
     def _evaluation(self, split: str, batch_size: int) -> EvaluationLoader | list[Any]:
         if self.index.count(split) == 0:

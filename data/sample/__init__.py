@@ -14,3 +14,7 @@ SAMPLES = {name: FOLDER / name for name in ("bmfr", "stills", "layers")}
 TRAIN_PATCHES = 320
 """Training patches per 1280x720 frame that a sample is prepared with unless told otherwise: at the usual
 density its few small frames give 5 patches each, too few to learn from."""
+
+CANDIDATES = 3600
+"""Candidates of importance sampling per 1280x720 frame that a sample is prepared with unless told otherwise:
+a hundred per frame of 160x160, of which about two thirds are kept."""

@@ -183,7 +183,7 @@ class Batches(Dataset[Packed]):
             return
         np.copyto(target.numpy(), turned(plain, change.turn))
         if name in IMAGE_PLANE:
-            turn_vectors(target.numpy(), change.turn)
+            turn_vectors(target.numpy(), change.turn, name)
 
     def _source(self, number: int, name: str, alone: bool = False) -> Tensor:
         """Return a buffer (C, H, W) of a sample, stored or computed; `alone`: without history."""

@@ -77,9 +77,17 @@ def _frames(frames: FrameSet, scene: str, options: PrepareOptions, wanted: set[i
             computed = _known(kept, _looked_at(options))
             if "depth" in kept.buffers:
                 computed.append("depth")
-            yield frames.read_stored(
-                scene, kept.index, _known(kept, options.stored), computed, samples=samples
-            )
+            yield frames.read_stored(scene, kept.index, _stored(kept, options), computed, samples=samples)
+
+
+def _stored(record: FrameRecord, options: PrepareOptions) -> list[str]:
+    """Return what is read to be stored: what the frame is known to have, and all that was asked for.
+
+    Manifests say what is derived as a rule; more can be, such as specular light from the whole and its
+    diffuse part.
+    """
+    asked = (name for name in options.buffers if name not in ("irradiance", "history"))
+    return list(dict.fromkeys((*_known(record, options.stored), *asked)))
 
 
 def _looked_at(options: PrepareOptions) -> tuple[str, ...]:
@@ -102,7 +110,7 @@ def _accumulated(
     for record in found.frames:
         computed = _known(record, needed)
         frame, halves = frames.read_stored(
-            scene, record.index, _known(record, options.stored), computed, samples=samples
+            scene, record.index, _stored(record, options), computed, samples=samples
         )
         if not frame.accumulated:
             frame = accumulator.step(frame)

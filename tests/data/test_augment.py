@@ -120,3 +120,32 @@ def test_history_is_dropped_with_the_given_probability_and_never_at_zero():
 def test_impossible_probability_of_dropped_history_is_refused(value):
     with pytest.raises(ValueError, match="drop_history"):
         Augmentation(drop_history=value)
+
+
+def test_variances_of_world_vectors_change_places_with_their_coordinates_and_stay_positive():
+    augmentation = Augmentation("none", seed=4, permute=True)
+    normal = np.array([0.1, -0.5, 0.8], np.float32).reshape(3, 1, 1)
+    for sample in range(60):
+        change = augmentation.change(0, sample)
+        squares = reordered(normal, "normal", change) ** 2
+        assert np.allclose(reordered(normal**2, "normal_variance", change), squares)
+
+
+@pytest.mark.parametrize("name", ["color", "diffuse", "specular", "albedo"])
+def test_variances_of_colours_are_permuted_with_what_they_belong_to(name: str):
+    change = Augmentation("none", seed=4, permute=True).change(0, 5)
+    image = np.arange(3, dtype=np.float32).reshape(3, 1, 1)
+    assert change.colors != (0, 1, 2)
+    expected = reordered(image, "reference", change)
+    assert np.array_equal(reordered(image, name, change), expected)
+    assert np.array_equal(reordered(image, f"{name}_variance", change), expected)
+    assert np.array_equal(reordered(image, "reference_diffuse", change), expected)
+
+
+@pytest.mark.parametrize("bits", range(8))
+def test_variance_of_motion_is_that_of_the_turned_motion(bits: int):
+    field = np.random.default_rng(2).normal(size=(2, 3, 3)).astype(np.float32)
+    squares = field**2
+    turn_vectors(field, Turn(bits))
+    turn_vectors(squares, Turn(bits), "motion_variance")
+    assert np.array_equal(squares, field**2)
