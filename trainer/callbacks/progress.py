@@ -54,6 +54,7 @@ class TrainingProgress(ProgressBar):
         self._rate = 0.0
         self._waiting = 0.0
         self._loss: float | None = None
+        self._gap: float | None = None
         self._paused_s = 0.0
 
     def disable(self) -> None:
@@ -88,14 +89,15 @@ class TrainingProgress(ProgressBar):
         """Count patches, and report at intervals."""
         self._patches += len(batch["scene"]) * trainer.world_size
         step, every = trainer.global_step, trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if step % every == 0 or batch_idx + 1 == trainer.num_training_batches:
+        due = step % every == 0
+        if due or batch_idx + 1 == trainer.num_training_batches:
             self._measure(trainer)
             pl_module.log_dict(
                 {"throughput/patches_per_s": self._rate, "throughput/waiting": self._waiting},
                 rank_zero_only=True,
             )
-        if outputs is not None and self._enabled and (self._bar is not None or step % every == 0):
-            self._loss = float(outputs["loss"] if isinstance(outputs, dict) else outputs)
+        if self._enabled and (self._bar is not None or due):
+            self._read(outputs)
         self._show(trainer)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -129,6 +131,14 @@ class TrainingProgress(ProgressBar):
         elif self._enabled:
             print(*args, file=sys.stderr)
 
+    def _read(self, outputs: Any) -> None:
+        """Keep what a training step returned: its loss, and the critics' gap where there are some."""
+        numbers = outputs if isinstance(outputs, dict) else {} if outputs is None else {"loss": outputs}
+        if numbers.get("loss") is not None:
+            self._loss = float(numbers["loss"])
+        if numbers.get("gap") is not None:
+            self._gap = float(numbers["gap"])
+
     def _measure(self, trainer: Trainer) -> None:
         now, waiting = time.monotonic(), waited(trainer)
         then, patches, waiting_then = self._mark
@@ -141,6 +151,8 @@ class TrainingProgress(ProgressBar):
         parts = [f"{self._rate:.1f} patches/s", f"waiting {self._waiting:.1%}"]
         if self._loss is not None:
             parts.append(f"loss {self._loss:.4f}")
+        if self._gap is not None:
+            parts.append(f"gap {self._gap:.3g}")
         if "val/psnr_wskp" in trainer.callback_metrics:
             parts.append(f"val {float(trainer.callback_metrics['val/psnr_wskp']):.2f} dB")
         return " | ".join(parts)

@@ -1,5 +1,6 @@
 """LightningModules."""
 
+from trainer.modules.adversarial import Adversarial
 from trainer.modules.regression import Regression
 
-__all__ = ["Regression"]
+__all__ = ["Adversarial", "Regression"]
