@@ -7,6 +7,7 @@
 from models.classical.joint_bilateral import JointBilateral
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
+from models.kpcn import KPCN
 from models.wskp import WSKP
 
-__all__ = ["WSKP", "JointBilateral"]
+__all__ = ["KPCN", "WSKP", "JointBilateral"]

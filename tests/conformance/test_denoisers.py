@@ -15,10 +15,12 @@ from models.denoiser import Denoiser, select
 from models.tiling import denoise_tiled
 from tests.models.frames import largest_relative, lit, luminous, split_buffers
 
-KERNEL_METHODS = {"WSKP", "JointBilateral"}
+KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral"}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
-ARGUMENTS: dict[str, dict[str, Any]] = {}
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "KPCN": {"width": 8, "layers": 3, "kernel_size": 7},
+}
 """Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""
 
 
