@@ -4,10 +4,12 @@
 `models.denoiser.Denoiser`. The contract itself can be imported from here too.
 """
 
+from models.acfm import ACFM
+from models.afgsa import AFGSA
 from models.classical.joint_bilateral import JointBilateral
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN
 from models.wskp import WSKP
 
-__all__ = ["KPCN", "WSKP", "JointBilateral"]
+__all__ = ["ACFM", "AFGSA", "KPCN", "WSKP", "JointBilateral"]

@@ -6,25 +6,34 @@ The functions take state dicts, not files: load a checkpoint with
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any, Literal, cast, overload
 
 import torch
 from torch import Tensor
 
+from models.afgsa import AFGSA
 from models.blocks.rep import RepBlock
+from models.denoiser import Denoiser
 from models.wskp import WSKP
 
 _BRANCHES = (5, 3, 1)
 _PUBLISHED_KERNELS = (3, 5, 7, 9, 11, 13)
 
 
-def load_published(name: str, state_dict: Mapping[str, Any]) -> WSKP:
+@overload
+def load_published(name: Literal["wskp"], state_dict: Mapping[str, Any]) -> WSKP: ...
+@overload
+def load_published(name: Literal["afgsa"], state_dict: Mapping[str, Any]) -> AFGSA: ...
+def load_published(name: str, state_dict: Mapping[str, Any]) -> Denoiser:
     """Return a denoiser with weights that the method's authors published.
 
     Args:
-        name: `wskp`: Fan et al. 2021, checkpoints of the authors' repository (MIT licence).
-        state_dict: The checkpoint (a dict with `model_state_dict`), or its inner dict of tensors.
+        name: `wskp`: Fan et al. 2021, checkpoints of the authors' repository. `afgsa`: Yu et al. 2021, the
+            generator. Both are under the MIT licence.
+        state_dict: The checkpoint (a dict with `model_state_dict` or `state_dict`), or its inner dict of
+            tensors. Names may begin with `module.`, as parallel training writes them.
 
     Returns:
         The network in evaluation mode, in its training form; its output is the authors' network's.
@@ -34,10 +43,13 @@ def load_published(name: str, state_dict: Mapping[str, Any]) -> WSKP:
     """
     if name not in _LOADERS:
         raise ValueError(f"no published weights are known for {name!r}; known: {', '.join(_LOADERS)}")
-    inner = state_dict.get("model_state_dict", state_dict)
+    inner: Any = state_dict
+    for wrapper in ("model_state_dict", "state_dict"):
+        inner = inner.get(wrapper, inner) if isinstance(inner, Mapping) else inner
     if not isinstance(inner, Mapping) or not all(isinstance(v, Tensor) for v in inner.values()):
         raise ValueError(f"{name}: expected names and tensors, or a checkpoint with 'model_state_dict'")
-    return _LOADERS[name](cast(Mapping[str, Tensor], inner))
+    weights = {key.removeprefix("module."): value for key, value in inner.items()}
+    return _LOADERS[name](weights)
 
 
 def _load_wskp(weights: Mapping[str, Tensor]) -> WSKP:
@@ -56,8 +68,51 @@ def _load_wskp(weights: Mapping[str, Tensor]) -> WSKP:
     for prefix, block in zip(prefixes, network.blocks, strict=True):
         convolutions = cast(RepBlock, block).convolutions
         for size, convolution in zip(_BRANCHES, convolutions, strict=True):
-            _copy(f"{prefix}_{size}.weight", weights, cast(torch.nn.Conv2d, convolution).weight)
+            name = f"{prefix}_{size}.weight"
+            _copy(f"wskp: {name}", weights[name], cast(torch.nn.Conv2d, convolution).weight)
     return network.eval()
+
+
+def _load_afgsa(weights: Mapping[str, Tensor]) -> AFGSA:
+    """Entries: conv<k>.0, conv_map.0, conv_a<k>.0, conv_aenc<1, 2>.0, transformer_blocks.<i>…, decoder.<i>.0.
+
+    Width, kernel sizes and blocks are read from the names and shapes. Heads, of half the channels of a row
+    table each, are too; blocks have a halo of 3 and the rest of the table's length.
+    """
+    table = weights.get("transformer_blocks.0.attention.rel_h")
+    if table is None or table.ndim != 4 or "conv_map.0.weight" not in weights:
+        listed = ", ".join(list(weights)[:5]) or "nothing"
+        raise ValueError(f"afgsa: not the entries of the authors' generator (conv1.0.weight …); got {listed}")
+    width = weights["conv_map.0.weight"].shape[0]
+    sizes = sorted(int(m[1]) for m in (re.fullmatch(r"conv(\d+)\.0\.weight", key) for key in weights) if m)
+    blocks = len({key.split(".")[1] for key in weights if key.startswith("transformer_blocks.")})
+    network = AFGSA(
+        width=width, blocks=blocks, heads=width // (2 * table.shape[3]), kernel_sizes=sizes,
+        block=table.shape[1] - 6, halo=3,
+    )  # fmt: skip
+    targets = network.state_dict()
+    names = {_authors_name(key, sizes): key for key in targets}
+    _compare("afgsa: missing", set(names) - set(weights))
+    _compare("afgsa: unexpected", set(weights) - set(names))
+    for name, key in names.items():
+        source = weights[name]
+        if name.endswith(("rel_h", "rel_w")):
+            # (1, side, 1, channels) and (1, 1, side, channels) there.
+            source = source.reshape(-1, source.shape[-1])
+        _copy(f"afgsa: {name}", source, targets[key])
+    return network.eval()
+
+
+def _authors_name(key: str, sizes: list[int]) -> str:
+    """Return what AFGSA's authors call an entry of our network."""
+    for pattern, name in _AFGSA_NAMES:
+        found = re.fullmatch(pattern, key)
+        if found:
+            groups = found.groupdict()
+            if "branch" in groups:
+                groups["size"] = str(sizes[int(groups["branch"])])
+            return name.format(**groups)
+    raise KeyError(key)
 
 
 def _compare(what: str, names: set[str]) -> None:
@@ -65,12 +120,32 @@ def _compare(what: str, names: set[str]) -> None:
         raise ValueError(f"{what} {', '.join(sorted(names))}")
 
 
-def _copy(name: str, weights: Mapping[str, Tensor], target: Tensor) -> None:
-    source = weights[name]
+def _copy(name: str, source: Tensor, target: Tensor) -> None:
     if source.shape != target.shape:
-        raise ValueError(f"wskp: {name} has shape {tuple(source.shape)}, expected {tuple(target.shape)}")
+        raise ValueError(f"{name} has shape {tuple(source.shape)}, expected {tuple(target.shape)}")
     with torch.no_grad():
         target.copy_(source)
 
 
-_LOADERS: dict[str, Callable[[Mapping[str, Tensor]], WSKP]] = {"wskp": _load_wskp}
+_KIND = "(?P<kind>weight|bias)"
+_BLOCK = r"blocks\.(?P<block>\d+)\."
+_AFGSA_NAMES = (
+    (rf"color_features\.branches\.(?P<branch>\d)\.{_KIND}", "conv{size}.0.{kind}"),
+    (rf"color_features\.fusion\.{_KIND}", "conv_map.0.{kind}"),
+    (rf"auxiliary_features\.branches\.(?P<branch>\d)\.{_KIND}", "conv_a{size}.0.{kind}"),
+    (rf"auxiliary_features\.fusion\.{_KIND}", "conv_aenc1.0.{kind}"),
+    (rf"auxiliary_features\.second\.{_KIND}", "conv_aenc2.0.{kind}"),
+    (rf"{_BLOCK}attention\.rows", "transformer_blocks.{block}.attention.rel_h"),
+    (rf"{_BLOCK}attention\.columns", "transformer_blocks.{block}.attention.rel_w"),
+    (rf"{_BLOCK}attention\.fusion\.{_KIND}", "transformer_blocks.{block}.attention.conv_map.0.{kind}"),
+    (rf"{_BLOCK}attention\.query\.weight", "transformer_blocks.{block}.attention.q_conv.weight"),
+    (rf"{_BLOCK}attention\.key\.weight", "transformer_blocks.{block}.attention.k_conv.weight"),
+    (rf"{_BLOCK}attention\.value\.weight", "transformer_blocks.{block}.attention.v_conv.weight"),
+    (rf"{_BLOCK}first\.{_KIND}", "transformer_blocks.{block}.feed_forward.0.0.{kind}"),
+    (rf"{_BLOCK}second\.{_KIND}", "transformer_blocks.{block}.feed_forward.1.0.{kind}"),
+    (rf"decoder\.(?P<layer>\d)\.{_KIND}", "decoder.{layer}.0.{kind}"),
+    (rf"residual\.{_KIND}", "decoder.2.0.{kind}"),
+)
+"""Our entries as patterns, and how the authors of AFGSA call them."""
+
+_LOADERS: dict[str, Callable[[Mapping[str, Tensor]], Denoiser]] = {"wskp": _load_wskp, "afgsa": _load_afgsa}

@@ -19,7 +19,9 @@ KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral"}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
+    "AFGSA": {"width": 16, "blocks": 2, "heads": 2},
     "KPCN": {"width": 8, "layers": 3, "kernel_size": 7},
+    "ACFM": {"blocks": 2, "width": 16, "condition_width": 16, "condition": 8},
 }
 """Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""
 
