@@ -15,9 +15,9 @@ The authors' code is followed, the paper names few sizes. Where the code contrad
 - depth is divided by the largest of the crop in training and of the image in testing; here always of the
   frame (`depth_scale="crop"` gives the training's);
 - its test leaves the components apart; here they are put together as the paper says;
-- the last layer ends in a ReLU. A random one of its three channels is often negative for every image, and
-  then gets no gradient. The weights start as the authors' (Kaiming normal, times 0.1, no biases), but with
-  the sign of each channel's last weights chosen such that a grey image gives a positive value;
+- the last layer ends in a ReLU. With random weights every other of its three channels is negative for most
+  pixels, which then give it no gradient. The weights start as the authors' (Kaiming normal, times 0.1, no
+  biases), but the sign of each channel's last ones is chosen such that a grey image gives a positive value;
 - the diffuse reference is divided by the reference's own albedo; here by the noisy frame's, the one that
   multiplies the result. They agree but for noise at edges and behind lens blur: there the network learns the
   reference's colour over the noisy albedo, which makes the product, not the quotient, right.
@@ -38,13 +38,12 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from models.denoiser import Buffers, Denoised, Denoiser, Pair
+from models.ops.modulation import SLOPE, Weights, modulated_convolution, plain_modulated_convolution
 
 ALBEDO_OFFSET = 0.00316
 """Added to the albedo before dividing by it."""
 GUIDES = 7
 """Channels of the condition: normal 3, depth 1, albedo 3."""
-SLOPE = 0.1
-"""Of the leaky ReLUs of the condition and of the modulations."""
 LARGEST = 1e12
 """Exposed radiance is cut here, so that its logarithm and products stay finite."""
 LARGEST_LOG = 40.0
@@ -63,54 +62,32 @@ class Logs(NamedTuple):
     specular: Tensor
 
 
-class Modulation(nn.Module):
-    """Conditioned feature modulation: x * (1 + scale(condition)) + shift(condition), pixel by pixel.
+class Modulated(nn.Module):
+    """A conditioned feature modulation, x * (1 + scale(condition)) + shift(condition), and a 3x3 convolution.
 
     Args:
-        condition: Channels of the condition.
-        width: Channels of x.
+        condition: Channels of the condition, and of the layers inside scale and shift.
+        width: Channels of x and of the result.
     """
 
     def __init__(self, condition: int, width: int) -> None:
         super().__init__()
-        self.scale, self.shift = (
-            nn.Sequential(
-                nn.Conv2d(condition, condition, 1),
-                nn.LeakyReLU(SLOPE, inplace=True),
-                nn.Conv2d(condition, width, 1),
-            )
-            for _ in range(2)
+        self.modulation = nn.ModuleDict(
+            {
+                name: nn.Sequential(
+                    nn.Conv2d(condition, condition, 1), nn.LeakyReLU(SLOPE), nn.Conv2d(condition, width, 1)
+                )
+                for name in ("scale", "shift")
+            }
         )
-
-    def forward(self, maps: Tensor, condition: Tensor) -> Tensor:
-        """Return the modulated maps (B, width, H, W); `condition` is (B, condition, H, W)."""
-        return torch.addcmul(maps + self.shift(condition), maps, self.scale(condition))
-
-
-class Modulated(nn.Module):
-    """A modulation and the 3x3 convolution behind it.
-
-    In training only `maps` is kept for the backward pass: the modulation, five times as large, is computed
-    again there, a tenth of the convolution's work.
-    """
-
-    def __init__(self, condition: int, width: int) -> None:
-        super().__init__()
-        self.modulation = Modulation(condition, width)
         self.convolution = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, maps: Tensor, condition: Tensor) -> Tensor:
-        """Return (B, width, H, W)."""
-        if torch.is_grad_enabled() and not _exporting():
-            result: Tensor = checkpoint(
-                self._compute, maps, condition, use_reentrant=False, preserve_rng_state=False
-            )
-            return result
-        return self._compute(maps, condition)
-
-    def _compute(self, maps: Tensor, condition: Tensor) -> Tensor:
-        result: Tensor = self.convolution(self.modulation(maps, condition))
-        return result
+        """Return (B, width, H, W) from x of that shape and the condition (B, condition, H, W)."""
+        weights = Weights(*self.parameters())  # modulation first, scale before shift
+        if _exporting():
+            return plain_modulated_convolution(maps, condition, weights)
+        return modulated_convolution(maps, condition, weights)
 
 
 class Block(nn.Module):
@@ -123,7 +100,8 @@ class Block(nn.Module):
 
     def forward(self, maps: Tensor, condition: Tensor) -> Tensor:
         """Return (B, width, H, W)."""
-        result: Tensor = maps + self.second(functional.relu(self.first(maps, condition)), condition)
+        inner = functional.relu(self.first(maps, condition), inplace=True)
+        result: Tensor = self.second(inner, condition).add_(maps)
         return result
 
 
@@ -149,7 +127,7 @@ class Generator(nn.Module):
         self.body = Modulated(condition, width)
         self.tail = nn.Conv2d(width, width, 3, padding=1)
         self.last = nn.Conv2d(width, 3, 3, padding=1)
-        self.checkpoint_blocks = 0
+        self.checkpointed = 0
 
     def forward(self, component: Tensor, guides: Tensor) -> Tensor:
         """Return the clean component (B, 3, H, W), float32 (or float64) and at least 0.
@@ -162,11 +140,11 @@ class Generator(nn.Module):
         head = maps = self.head(component)
         repeat = torch.is_grad_enabled() and not _exporting()
         for index, block in enumerate(self.blocks):
-            if repeat and index < self.checkpoint_blocks:
+            if repeat and index < self.checkpointed:
                 maps = checkpoint(block, maps, condition, use_reentrant=False, preserve_rng_state=False)
             else:
                 maps = block(maps, condition)
-        maps = functional.relu(self.tail(head + self.body(maps, condition)))
+        maps = functional.relu(self.tail(self.body(maps, condition).add_(head)), inplace=True)
         with torch.autocast(maps.device.type, enabled=False):
             # A logarithm with the 8 bits of bfloat16 would be radiance in steps of a per cent.
             maps = maps if maps.dtype == torch.float64 else maps.float()
@@ -203,7 +181,7 @@ class ACFM(Denoiser):
         normal_range: `unit`: normals as [0, 1] for both networks; `published`: the diffuse one sees [-1, 1].
         depth_scale: Depth is divided by the largest of the `frame`, or, in training, of the `crop`.
         start: Factor on the random weights at the start.
-        checkpoint_blocks: Blocks of each network whose inside is computed again in the backward pass instead
+        checkpointed: Blocks of each network whose inside is computed again in the backward pass instead
             of being kept.
     """
 
@@ -222,7 +200,7 @@ class ACFM(Denoiser):
         normal_range: Literal["unit", "published"] = "unit",
         depth_scale: Literal["frame", "crop"] = "frame",
         start: float = 0.1,
-        checkpoint_blocks: int = 0,
+        checkpointed: int = 0,
     ) -> None:
         super().__init__()
         sizes = {"width": width, "condition_width": condition_width, "condition": condition}
@@ -239,7 +217,7 @@ class ACFM(Denoiser):
         self.diffuse, self.specular = (Generator(blocks, width, condition_width, condition) for _ in range(2))
         for network in (self.diffuse, self.specular):
             network.start(start)
-            network.checkpoint_blocks = checkpoint_blocks
+            network.checkpointed = checkpointed
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Denoiser.forward`.
