@@ -62,6 +62,7 @@ def test_run_holds_configuration_packages_pictures_and_files(run):
     assert any(name.endswith(".png") and "validation" in name for name in names)
 
 
+@pytest.mark.slow
 def test_recorded_configuration_trains_again(trained, workplace):
     config = yaml.safe_load((trained.runs[0] / "config.yaml").read_text())
     assert config["model"]["init_args"]["net"]["init_args"]["layers"] == 6
@@ -122,12 +123,14 @@ def test_last_without_a_run_is_an_error_that_says_where_it_looked(workplace):
     assert "no run of 'wskp_bmfr' below" in printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--trainer.precision=bf16-mixed", "--trainer.gradient_clip_val=0.5"])
 def test_precision_and_clipping_are_options(workplace, option):
     workplace.trainer("fit", "--config", "wskp_bmfr.yaml", "--config", "smoke.yaml", option)
     assert np.isfinite(float(open_metrics(workplace)["train/loss_epoch"]))
 
 
+@pytest.mark.slow
 def test_averaged_weights_are_an_option(workplace):
     workplace.trainer(
         "fit", "--config", "wskp_bmfr.yaml", "--config", "smoke.yaml",
