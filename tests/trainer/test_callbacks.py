@@ -88,9 +88,11 @@ def test_batch_of_another_rank_is_saved_in_the_first_ranks_folder(first_rank, mo
     trainer = second_rank(monkeypatch, first_rank)
     guard = FiniteGuard()
     guard.setup(trainer, None, "fit")
-    with pytest.raises(ValueError, match="the loss became nan at step 5"):
-        guard.on_train_batch_end(trainer, None, torch.tensor(float("nan")), {"color": torch.ones(1)}, 0)
-    assert [path.name for path in folder.iterdir()] == ["nonfinite-step5-rank1.pt"]
+    module = SimpleNamespace(trainer=trainer, automatic_optimization=True)
+    guard.on_train_batch_start(trainer, module, {"color": torch.ones(1)}, 0)
+    with pytest.raises(ValueError, match="the loss became nan at step 6"):
+        guard.on_before_backward(trainer, module, torch.tensor(float("nan")))
+    assert [path.name for path in folder.iterdir()] == ["diverged-step6-rank1.pt"]
     assert list(folder.parent.iterdir()) == [folder]
 
 
@@ -108,7 +110,7 @@ def test_first_loss_that_is_not_finite_stops_with_the_batch_saved(tmp_path, monk
         small_trainer(tmp_path, FiniteGuard(), limit_val_batches=0).fit(
             Regression(WSKP(layers=3)), datamodule=_Poisoned()
         )
-    saved = torch.load(next(tmp_path.glob("nonfinite-step*.pt")), weights_only=True)
+    saved = torch.load(next(tmp_path.glob("diverged-step2-*.pt")), weights_only=True)
     assert torch.isnan(saved["irradiance"]).any()
     assert saved["scene"] == ["step"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,14 @@ class _RunCheckpoint(ModelCheckpoint):
         if self.dirpath is None and isinstance(trainer.logger, MLflowTracking):
             self.dirpath = str(trainer.logger.share_folder(trainer.strategy.broadcast) / "checkpoints")
         super().setup(trainer, pl_module, stage)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save where that is due: the weights after the step, which Lightning warns of without need."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Using ModelCheckpoint with manual optimization")
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
 
 class BestCheckpoint(_RunCheckpoint):

@@ -70,10 +70,9 @@ class FiniteGuard(Callback):
         """
         loss = outputs.get("loss") if isinstance(outputs, dict) else outputs
         if loss is not None and not pl_module.automatic_optimization:
-            self._check(pl_module, loss, "the loss", taken=True)
+            self._check(pl_module, loss, "the loss", taken=1)
         self._batch = {}
 
-    def _check(self, module: LightningModule, value: Tensor, name: str, taken: bool = False) -> None:
+    def _check(self, module: LightningModule, value: Tensor, name: str, taken: int = 0) -> None:
         if not bool(torch.isfinite(value).all()):
-            step = module.trainer.global_step + (0 if taken else 1)
-            raise diverged(module, self._batch, f"{name} became {float(value)} at step {step}")
+            raise diverged(module, self._batch, f"{name} became {float(value.detach())}", taken)

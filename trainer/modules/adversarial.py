@@ -24,7 +24,7 @@ code updates the critic before the denoiser, ACFM's after it (`critic_first`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -32,18 +32,24 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
+from models.critic import Critic
 from models.denoiser import Denoiser, Pair
 from trainer.divergence import diverged
 from trainer.modules.evaluation import Batch, Evaluated
 from trainer.modules.penalty import gradient_penalty, mixing
-from trainer.modules.updates import Side, Turn, turn
-from trainer.schedules import OneCycle
-
-MakeOptimizer = Callable[[Iterable], Optimizer]
-MakeSchedule = Callable[[Optimizer], LRScheduler]
+from trainer.modules.updates import (
+    MakeOptimizer,
+    MakeSchedule,
+    Side,
+    Turn,
+    advance,
+    check_crops,
+    check_groups,
+    check_number,
+    scheduled,
+    turn,
+)  # fmt: skip
 
 
 class Adversarial(Evaluated):
@@ -54,8 +60,8 @@ class Adversarial(Evaluated):
 
     Args:
         net: The denoiser to train.
-        critic: Makes a critic (`models.critic.Critic`), one for each pair that the denoiser is compared in: a
-            class path in a configuration. Not made where `adversarial_weight` is 0.
+        critic: Makes a critic, one for each pair that the denoiser is compared in; a class path in a
+            configuration. None is made where `adversarial_weight` is 0.
         adversarial_weight: Of -mean D(G(x)) in the denoiser's loss; 0 trains without critics.
         l1_weight: Of the mean absolute difference.
         penalty_weight: Of the gradient penalty in the critic's loss.
@@ -88,7 +94,7 @@ class Adversarial(Evaluated):
     def __init__(
         self,
         net: Denoiser,
-        critic: Callable[[], nn.Module] | None = None,
+        critic: Callable[[], nn.Module] = Critic,
         adversarial_weight: float = 0.005,
         l1_weight: float = 1.0,
         penalty_weight: float = 10.0,
@@ -109,23 +115,16 @@ class Adversarial(Evaluated):
         super().__init__(net)
         self.keep_arguments()
         self.automatic_optimization = False
-        if adversarial_weight and critic is None:
-            raise ValueError(
-                "adversarial training needs a critic (--model.critic models.critic.Critic), "
-                "or --model.adversarial_weight 0"
-            )
-        names = net.compared if adversarial_weight and critic is not None else ()
-        self.critics = nn.ModuleDict({name: critic() for name in names if critic is not None})
+        self.critics = nn.ModuleDict({name: critic() for name in net.compared if adversarial_weight})
         self.adversarial_weight, self.l1_weight = adversarial_weight, l1_weight
         self.penalty_weight, self.halved = penalty_weight, halved
-        self.critic_first, self.critic_steps = critic_first, critic_steps if names else 1
+        self.critic_first, self.critic_steps = critic_first, critic_steps if self.critics else 1
         self.accumulate, self.gradient_clip = accumulate, gradient_clip
         self.make_optimizer, self.make_lr_scheduler = optimizer, lr_scheduler
         self.make_critic_optimizer = critic_optimizer or optimizer
         self.make_critic_lr_scheduler = critic_lr_scheduler or lr_scheduler
         self.lr_scales, self.frozen_steps = dict(lr_scales or {}), dict(frozen_steps or {})
         self.divergence_limit, self.seed = divergence_limit, seed
-        self.net_side, self.critic_side = Side("train"), Side("critic")
         self._check_arguments()
 
     def setup(self, stage: str) -> None:
@@ -143,6 +142,7 @@ class Adversarial(Evaluated):
                 f"Adversarial does not train with precision {self.trainer.precision}, whose range or "
                 "resolution the gradient penalty exceeds; use --trainer.precision bf16-mixed or 32-true"
             )
+        self.net_side, self.critic_side = Side("train"), Side("critic")
         # Steps, lengths of schedules and logs are derived from it; manual optimisation ignores it otherwise.
         self.trainer.accumulate_grad_batches = self.accumulate * self.critic_steps
 
@@ -160,10 +160,10 @@ class Adversarial(Evaluated):
         for group in optimizer.param_groups:
             group["lr"] *= self.lr_scales.get(group["name"], 1.0)
         steps = self.trainer.estimated_stepping_batches
-        made = [_with_schedule(optimizer, self.make_lr_scheduler, steps)]
+        made = [scheduled(optimizer, self.make_lr_scheduler, steps)]
         if self.critics:
             optimizer = self.make_critic_optimizer(self.critics.parameters())
-            made.append(_with_schedule(optimizer, self.make_critic_lr_scheduler, steps * self.critic_steps))
+            made.append(scheduled(optimizer, self.make_critic_lr_scheduler, steps * self.critic_steps))
         return made
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
@@ -173,11 +173,11 @@ class Adversarial(Evaluated):
             ValueError: Crops do not fit the critic, or the training diverges; the batch is saved then, and
                 the weights are those before the update.
         """
-        batches = self.trainer.num_training_batches
+        batches = batch_idx + 1 if self.trainer.is_last_batch else self.trainer.num_training_batches
         now = turn(batch_idx, batches, self.accumulate, self.critic_steps)
         with torch.set_grad_enabled(now.net):
             pairs = self.net.training_pairs(batch)
-        self._check_crops(pairs)
+        check_crops(self.critics, pairs)
         critic_first = self.critic_first and self.accumulate == 1
         result: dict[str, Tensor] = {}
         with self._unsynchronised():
@@ -189,9 +189,9 @@ class Adversarial(Evaluated):
                 result |= self._train_critics(pairs, batch, batch_idx, now)
         if now.net and now.ends:
             self._update_net(batch)
-        if batch_idx + 1 >= batches or self.trainer.is_last_batch:
+        if batch_idx + 1 >= batches:
             for optimizer in self.trainer.optimizers:
-                self._advance(optimizer, "epoch")
+                advance(self.trainer, optimizer, "epoch")
         return result
 
     def validation_loss(self, batch: Batch, output: Tensor, target: Tensor) -> Tensor:
@@ -226,11 +226,10 @@ class Adversarial(Evaluated):
         self.critic_side.count(numbers, names=tuple(self.critics))
         if now.ends:
             _, optimizer = self.trainer.optimizers
-            parameters = list(self.critics.parameters())
-            self._settle(self.critic_side, parameters, batch)
+            self._settle(self.critic_side, list(self.critics.parameters()), batch)
             optimizer.step()  # past Lightning, which would count it as a step of the training
             optimizer.zero_grad()
-            self._advance(optimizer, "step")
+            advance(self.trainer, optimizer, "step")
         return {"gap": torch.stack(numbers["gap"]).sum()}
 
     def _learn(self, pairs: dict[str, Pair]) -> dict[str, Tensor]:
@@ -251,31 +250,25 @@ class Adversarial(Evaluated):
 
     def _update_net(self, batch: Batch) -> None:
         """Take a step of the denoiser, the one that the trainer counts, and log both sides."""
-        parameters = list(self.net.parameters())
         for name, group in self.net.parameter_groups().items():
             if self.trainer.global_step < self.frozen_steps.get(name, 0):
                 for parameter in group:
                     parameter.grad = None
-        self._settle(self.net_side, parameters, batch)
+        self._settle(self.net_side, list(self.net.parameters()), batch)
         optimizers = self.optimizers()
         optimizer = optimizers[0] if isinstance(optimizers, list) else optimizers
         optimizer.step()
         optimizer.zero_grad()
-        self._advance(self.trainer.optimizers[0], "step")
+        advance(self.trainer, self.trainer.optimizers[0], "step")
         numbers = self.net_side.numbers | self.critic_side.numbers
-        self.log(
-            "train/loss_epoch",
-            numbers["train/loss"],
-            on_step=False,
-            on_epoch=True,
-            sync_dist=True,
-            batch_size=1,
-        )
+        loss = numbers.pop("train/loss")
+        self.log("train/loss_epoch", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=1)
         step = self.trainer.global_step
         if step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            numbers["train/loss_step"] = numbers.pop("train/loss")
+            # Not by self.log, which would repeat the numbers after batches that update nothing.
+            numbers |= {"train/loss_step": loss, "epoch": self.current_epoch}
             for logger in self.trainer.loggers:
-                logger.log_metrics(numbers | {"epoch": self.current_epoch}, step=step - 1)
+                logger.log_metrics(numbers, step=step - 1)
 
     def _settle(self, side: Side, parameters: list[nn.Parameter], batch: Batch) -> None:
         """Average and clip the gradients of a side.
@@ -286,17 +279,11 @@ class Adversarial(Evaluated):
         side.settle(parameters, self.gradient_clip)
         watched = (f"{side.prefix}/gradient_norm", f"{side.prefix}/gap")
         for name, value in side.numbers.items():
-            place = f"{name} became {value:.4g} at step {self.trainer.global_step + 1}"
             if not math.isfinite(value):
-                raise diverged(self, batch, place)
+                raise diverged(self, batch, f"{name} became {value}")
             if name in watched and abs(value) > self.divergence_limit:
-                raise diverged(self, batch, f"{place}, beyond the limit of {self.divergence_limit:g}")
-
-    def _advance(self, optimizer: Optimizer, interval: str) -> None:
-        for config in self.trainer.lr_scheduler_configs:
-            schedule = config.scheduler
-            if schedule.optimizer is optimizer and getattr(schedule, "interval", "epoch") == interval:
-                schedule.step()  # type: ignore[call-arg]
+                limit = f"beyond divergence_limit {self.divergence_limit:g}"
+                raise diverged(self, batch, f"{name} became {value:.4g}, {limit},")
 
     def _unsynchronised(self) -> AbstractContextManager[None]:
         """Return a context in which DDP sends no gradients."""
@@ -304,51 +291,10 @@ class Adversarial(Evaluated):
         context = getattr(self.trainer.strategy, "block_backward_sync", nullcontext)()
         return context
 
-    def _check_crops(self, pairs: dict[str, Pair]) -> None:
-        for name, critic in self.critics.items():
-            size, shape = getattr(critic, "size", None), tuple(pairs[name].target.shape[-2:])
-            if size is not None and shape != (size, size):
-                raise ValueError(
-                    f"crops are {shape[1]}x{shape[0]} pixels, the critic takes {size}x{size}: prepare data "
-                    f"with --data.patch_size {size}, or set --model.critic.init_args.size"
-                )
-
     def _check_arguments(self) -> None:
-        numbers = ("adversarial_weight", "l1_weight", "penalty_weight", "seed")
-        positive = ("critic_steps", "accumulate", "divergence_limit")
-        for name in (*numbers, *positive):
-            value = getattr(self, name)
-            if value < 0 or (name in positive and value <= 0):
-                raise ValueError(
-                    f"{name} must be {'positive' if name in positive else 'at least 0'}, got {value}"
-                )
-        if self.gradient_clip is not None and self.gradient_clip <= 0:
-            raise ValueError(f"gradient_clip must be positive or null, got {self.gradient_clip}")
-        groups = self.net.parameter_groups()
-        for option, values in (("lr_scales", self.lr_scales), ("frozen_steps", self.frozen_steps)):
-            for name, value in values.items():
-                if name not in groups:
-                    raise ValueError(
-                        f"{option}: {type(self.net).__name__} has no parameter group {name!r}; "
-                        f"it has {', '.join(groups)}"
-                    )
-                if value < 0 or (option == "lr_scales" and value == 0):
-                    raise ValueError(f"{option}: {name} is {value}, expected a positive number")
-
-
-def _with_schedule(optimizer: Optimizer, make: MakeSchedule | None, steps: float) -> dict[str, Any]:
-    """Return an optimiser and its schedule as Lightning takes them.
-
-    Raises:
-        ValueError: The schedule waits for a score, which is not known here.
-    """
-    if make is None:
-        return {"optimizer": optimizer}
-    schedule = make(optimizer)
-    if isinstance(schedule, ReduceLROnPlateau):
-        raise ValueError(
-            "Adversarial cannot use ReduceLROnPlateau; use trainer.schedules.Halving or OneCycle"
-        )
-    if isinstance(schedule, OneCycle):
-        schedule.span(int(steps))
-    return {"optimizer": optimizer, "lr_scheduler": schedule}
+        for name in ("adversarial_weight", "l1_weight", "penalty_weight", "seed"):
+            check_number(name, getattr(self, name), zero=True)
+        for name in ("critic_steps", "accumulate", "divergence_limit", "gradient_clip"):
+            check_number(name, getattr(self, name))
+        check_groups(self.net, "lr_scales", self.lr_scales)
+        check_groups(self.net, "frozen_steps", self.frozen_steps, zero=True)

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, distributed
+from lightning.pytorch import Trainer
+from torch import Tensor, distributed, nn
 from torch.nn import Parameter
 from torch.nn.utils import clip_grad_norm_
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
+
+from models.denoiser import Denoiser, Pair
+from trainer.schedules import OneCycle
+
+MakeOptimizer = Callable[[Iterable], Optimizer]
+MakeSchedule = Callable[[Optimizer], LRScheduler]
 
 
 class Turn(NamedTuple):
@@ -108,3 +117,58 @@ class Side:
         self.numbers = dict(zip(self._sums, joint.tolist(), strict=True))
         self.numbers[f"{self.prefix}/gradient_norm"] = float(norm)
         self._batches, self._sums = 0, {}
+
+
+def scheduled(optimizer: Optimizer, make: MakeSchedule | None, steps: float) -> dict[str, Any]:
+    """Return an optimiser and its schedule as Lightning takes them.
+
+    Raises:
+        ValueError: The schedule waits for a score, which is not known here.
+    """
+    if make is None:
+        return {"optimizer": optimizer}
+    schedule = make(optimizer)
+    if isinstance(schedule, ReduceLROnPlateau):
+        raise ValueError(
+            "Adversarial cannot use ReduceLROnPlateau; use trainer.schedules.Halving or OneCycle"
+        )
+    if isinstance(schedule, OneCycle):
+        schedule.span(int(steps))
+    return {"optimizer": optimizer, "lr_scheduler": schedule}
+
+
+def advance(trainer: Trainer, optimizer: Optimizer, interval: str) -> None:
+    """Step the schedules of an optimiser that count `interval`, step or epoch."""
+    for config in trainer.lr_scheduler_configs:
+        schedule = config.scheduler
+        if schedule.optimizer is optimizer and getattr(schedule, "interval", "epoch") == interval:
+            schedule.step()  # type: ignore[call-arg]
+
+
+def check_crops(critics: nn.ModuleDict, pairs: Mapping[str, Pair]) -> None:
+    """Raise a ValueError unless the images of each pair have the size that its critic takes."""
+    for name, critic in critics.items():
+        size, (height, width) = getattr(critic, "size", None), pairs[name].target.shape[-2:]
+        if size is not None and (height, width) != (size, size):
+            raise ValueError(
+                f"crops are {width}x{height} pixels, the critic takes {size}x{size}: prepare the data with "
+                f"--data.patch_size {size}, or set --model.critic.init_args.size"
+            )
+
+
+def check_number(name: str, value: float | None, zero: bool = False) -> None:
+    """Raise a ValueError unless an option is positive, or None, or zero where that is allowed."""
+    if value is not None and not (value > 0 or (zero and value == 0)):
+        raise ValueError(f"{name} is {value}, expected {'at least 0' if zero else 'more than 0'}")
+
+
+def check_groups(net: Denoiser, option: str, values: Mapping[str, float], zero: bool = False) -> None:
+    """Raise a ValueError unless an option names parameter groups of the denoiser, with positive numbers."""
+    groups = net.parameter_groups()
+    for name, value in values.items():
+        if name not in groups:
+            known = ", ".join(groups)
+            raise ValueError(
+                f"{option}: {type(net).__name__} has no parameter group {name!r}, it has {known}"
+            )
+        check_number(f"{option}: {name}", value, zero)
