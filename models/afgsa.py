@@ -116,7 +116,7 @@ class AFGSA(Denoiser):
                 `depth` (B, 1, H, W) in scene units and `albedo` (B, 3, H, W) those that `inputs` names;
                 optionally `exposure` (B,) and `depth_range` (B, 2).
         """
-        exposed = torch.expm1(self.predict(buffers).clamp(0.0, math.log1p(LARGEST)))
+        exposed = _expm1(self.predict(buffers).clamp(0.0, math.log1p(LARGEST)))
         return Denoised(exposed / self._exposure(buffers))
 
     def predict(self, buffers: Buffers) -> Tensor:
@@ -262,7 +262,15 @@ class AuxiliaryExtractor(Extractor):
 
 
 def _clean(exposed: Tensor) -> Tensor:
-    return torch.nan_to_num(exposed, 0.0, LARGEST, 0.0).clamp(0.0, LARGEST)
+    return torch.nan_to_num(exposed, 0.0).clamp(0.0, LARGEST)
+
+
+def _expm1(log: Tensor) -> Tensor:
+    """Return exp(x) - 1 of x >= 0 without cancellation, from what ONNX has where a graph is recorded."""
+    if not exporting():
+        return torch.expm1(log)
+    half = torch.tanh(0.5 * log.clamp_max(1.0))
+    return torch.where(log < 1.0, 2.0 * half / (1.0 - half), torch.exp(log) - 1.0)
 
 
 def _check(width: int, blocks: int, heads: int, kernel_sizes: Sequence[int], checkpointed: int) -> None:

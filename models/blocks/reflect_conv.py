@@ -21,8 +21,9 @@ class ReflectConv(nn.Conv2d):
 
     def __init__(self, inputs: int, outputs: int, size: int, slope: float = 0.0) -> None:
         super().__init__(inputs, outputs, size)
-        self.slope = slope
+        self.radius, self.slope = size // 2, slope
 
     def forward(self, images: Tensor, residual: Tensor | None = None) -> Tensor:
         """Return (B, outputs, H, W) of images (B, inputs, H, W), plus `residual` of the result's shape."""
-        return reflect_conv(images, self.weight, cast(Tensor, self.bias), self.slope, residual)
+        bias = cast(Tensor, self.bias)
+        return reflect_conv(images, self.weight, bias, self.radius, self.slope, residual)

@@ -19,7 +19,12 @@ from models.ops.boxes import exporting
 
 
 def reflect_conv(
-    images: Tensor, weight: Tensor, bias: Tensor, slope: float = 0.0, residual: Tensor | None = None
+    images: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    radius: int,
+    slope: float = 0.0,
+    residual: Tensor | None = None,
 ) -> Tensor:
     """Return leaky_relu(convolution(images), slope) [+ residual] of the same size, borders reflected.
 
@@ -27,9 +32,10 @@ def reflect_conv(
     Differentiable once.
 
     Args:
-        images: (B, C, H, W), larger than half the kernel.
-        weight: (D, C, K, K), K odd.
+        images: (B, C, H, W), H and W larger than the radius.
+        weight: (D, C, K, K) with K = 2 radius + 1.
         bias: (D,).
+        radius: Pixels that are reflected at each border; traced graphs need it as a number.
         slope: Of negative values; 0 is a ReLU, 1 leaves the result linear.
         residual: (B, D, H, W), added at the end.
     """
@@ -37,8 +43,8 @@ def reflect_conv(
     with torch.autocast(images.device.type, enabled=False):
         tensors = (images, weight, bias) if residual is None else (images, weight, bias, residual)
         if exporting() or not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
-            return _added(_convolved(images, weight, bias, slope), residual)
-        result: Tensor = _ReflectConv.apply(images, weight, bias, slope, residual)
+            return _added(_convolved(images, weight, bias, radius, slope), residual)
+        result: Tensor = _ReflectConv.apply(images, weight, bias, radius, slope, residual)
         return result
 
 
@@ -46,11 +52,11 @@ def pointwise(images: Sequence[Tensor], weight: Tensor, bias: Tensor | None = No
     """Return the 1x1 convolution of the images' concatenated channels, without concatenating them.
 
     Args:
-        images: Tensors (B, C_i, H, W).
-        weight: (D, sum of C_i, 1, 1).
+        images: Tensors (B, C, H, W), equal in channels.
+        weight: (D, number of images times C, 1, 1).
         bias: (D,).
     """
-    parts = weight.split([image.shape[1] for image in images], 1)
+    parts = weight.chunk(len(images), 1)
     total = F.conv2d(images[0], parts[0], bias)
     for image, part in zip(images[1:], parts[1:], strict=True):
         total = total + F.conv2d(image, part) if exporting() else total.add_(F.conv2d(image, part))
@@ -64,13 +70,12 @@ def _autocast(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(t.to(torch.get_autocast_dtype(device)) for t in tensors)
 
 
-def _reflected(images: Tensor, weight: Tensor) -> Tensor:
-    radius = weight.shape[-1] // 2
+def _reflected(images: Tensor, radius: int) -> Tensor:
     return F.pad(images, [radius] * 4, mode="reflect") if radius else images
 
 
-def _convolved(images: Tensor, weight: Tensor, bias: Tensor, slope: float) -> Tensor:
-    result = F.conv2d(_reflected(images, weight), weight, bias)
+def _convolved(images: Tensor, weight: Tensor, bias: Tensor, radius: int, slope: float) -> Tensor:
+    result = F.conv2d(_reflected(images, radius), weight, bias)
     if slope == 1:
         return result
     return F.relu_(result) if slope == 0 else F.leaky_relu_(result, slope)
@@ -85,10 +90,16 @@ def _added(result: Tensor, residual: Tensor | None) -> Tensor:
 class _ReflectConv(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, images: Tensor, weight: Tensor, bias: Tensor, slope: float, residual: Tensor | None
+        ctx: Any,
+        images: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        radius: int,
+        slope: float,
+        residual: Tensor | None,
     ) -> Tensor:
-        result = _convolved(images, weight, bias, slope)
-        ctx.slope = slope
+        result = _convolved(images, weight, bias, radius, slope)
+        ctx.radius, ctx.slope = radius, slope
         if slope == 1:
             ctx.save_for_backward(images, weight)
         else:
@@ -105,10 +116,9 @@ class _ReflectConv(torch.autograd.Function):
             own = torch.where(positive, own, own * ctx.slope if ctx.slope else 0.0)
         wanted = list(ctx.needs_input_grad[:3])
         d_images, d_weight, d_bias = torch.ops.aten.convolution_backward(
-            own, _reflected(images, weight), weight, [weight.shape[0]],
+            own, _reflected(images, ctx.radius), weight, [weight.shape[0]],
             [1, 1], [0, 0], [1, 1], False, [0, 0], 1, wanted,
         )  # fmt: skip
-        radius = weight.shape[-1] // 2
-        if wanted[0] and radius:
-            d_images = torch.ops.aten.reflection_pad2d_backward(d_images, images, [radius] * 4)
-        return d_images, d_weight, d_bias, None, gradient if ctx.needs_input_grad[4] else None
+        if wanted[0] and ctx.radius:
+            d_images = torch.ops.aten.reflection_pad2d_backward(d_images, images, [ctx.radius] * 4)
+        return d_images, d_weight, d_bias, None, None, gradient if ctx.needs_input_grad[5] else None
