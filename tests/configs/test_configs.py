@@ -1,5 +1,6 @@
 """Every shipped configuration parses, is instantiated and trains for one step."""
 
+import json
 import os
 import subprocess
 import sys
@@ -9,12 +10,70 @@ import yaml
 
 from trainer import configs
 
-OVERLAYS = {"smoke.yaml"}
+SMOKE = "smoke.yaml"
+SAMPLES = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
+"""Overlay → what it is laid over."""
+
+NARROW = {
+    "acfm_tungsten.yaml": {"net.init_args": {"blocks": 1, "width": 8, "condition_width": 8, "condition": 4}},
+    "afgsa_tungsten.yaml": {"net.init_args": {"blocks": 1, "width": 16}},
+    "kpcn_tungsten.yaml": {"net.init_args": {"layers": 2, "width": 4}},
+}
+"""Networks whose published size would take a minute for a step; their tests build them in that size."""
+for name in ("acfm_tungsten.yaml", "afgsa_tungsten.yaml"):
+    NARROW[name]["critic.init_args"] = {"width": 2}
+
+RUN = """
+import json, sys, traceback
+from trainer.cli import main
+codes = {}
+for name, arguments in json.loads(sys.argv[1]).items():
+    try:
+        sys.argv = ["trainer", *arguments]
+        codes[name] = main()
+    except BaseException:
+        traceback.print_exc()
+        codes[name] = "raised"
+print(json.dumps(codes))
+"""
+
+
+def arguments(name):
+    """What trains a configuration for one step, an overlay with what it is laid over."""
+    files = [SAMPLES[name], name] if name in SAMPLES else [name]
+    options = {
+        "trainer.limit_train_batches": 1,
+        "data.init_args.batch_size": 1,
+        "data.init_args.workers": 0,
+        "data.init_args.train_patches": 80,
+        "trainer.max_steps": -1,
+        "trainer.check_val_every_n_epoch": 1,
+        "trainer.logger.init_args.experiment": name.removesuffix(".yaml"),
+    }
+    for part, values in NARROW.get(name, {}).items():
+        options |= {f"model.init_args.{part}.{key}": value for key, value in values.items()}
+    layers = [part for file in (*files, SMOKE) for part in ("--config", file)]
+    return ["fit", *layers, *(part for key, value in options.items() for part in (f"--{key}", str(value)))]
+
+
+TRAINED = [name for name in configs.names() if name != SMOKE]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Exit code of each configuration, all trained by one process, the folder, and what it printed."""
+    folder = tmp_path_factory.mktemp("configs")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
+    environment |= {"OMP_NUM_THREADS": "2", "PENUMBRA_CACHE": str(folder / "cache")}
+    command = [sys.executable, "-c", RUN, json.dumps({name: arguments(name) for name in TRAINED})]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1]), folder, done.stderr
 
 
 def test_defaults_and_overlays_are_there():
     assert (configs.folder() / configs.DEFAULTS).is_file()
-    assert set(configs.names()) >= OVERLAYS
+    assert set(configs.names()) >= {SMOKE, *SAMPLES, *SAMPLES.values()}
 
 
 @pytest.mark.parametrize("name", configs.names())
@@ -25,15 +84,21 @@ def test_configuration_has_a_header_and_stays_short(name):
     assert isinstance(yaml.safe_load(text), dict)
 
 
-@pytest.mark.parametrize("name", [n for n in configs.names() if n not in OVERLAYS])
-def test_configuration_trains_for_one_step(name, tmp_path):
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
-    environment |= {"OMP_NUM_THREADS": "2", "PENUMBRA_CACHE": str(tmp_path / "cache")}
-    command = [
-        sys.executable, "-m", "trainer", "fit", "--config", name, "--config", "smoke.yaml",
-        "--trainer.limit_train_batches", "1", "--data.init_args.batch_size", "1",
-        "--data.init_args.workers", "0", "--data.init_args.train_patches", "80",
-    ]  # fmt: skip
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert list(tmp_path.glob("runs/*/*/checkpoints/last.ckpt"))
+@pytest.mark.parametrize("name", TRAINED)
+def test_configuration_trains_for_one_step(name, trained):
+    codes, folder, printed = trained
+    assert codes[name] == 0, printed
+    run = folder / "runs" / name.removesuffix(".yaml")
+    assert list(run.glob("*/checkpoints/best.ckpt"))
+    assert list(run.glob("*/export/*.onnx"))
+    assert list(run.glob("*/export/*.ts"))
+
+
+@pytest.mark.parametrize(("overlay", "base"), SAMPLES.items())
+def test_an_overlay_keeps_method_and_data_of_what_it_is_laid_over(overlay, base):
+    over, under = (yaml.safe_load((configs.folder() / name).read_text()) for name in (overlay, base))
+    assert over["model"]["class_path"] == under["model"]["class_path"]
+    networks = [file["model"]["init_args"]["net"]["class_path"] for file in (over, under)]
+    assert networks[0] == networks[1]
+    assert under["data"]["init_args"]["root"] == "sample:stills"
+    assert "root" not in over["data"]["init_args"]
