@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
 
 from models.denoiser import Denoiser
@@ -75,10 +75,12 @@ def class_arguments() -> set[str]:
     import trainer.callbacks
     import trainer.losses
     import trainer.modules
+    import trainer.schedules
+    from models.critic import Critic
     from trainer.tracking import MLflowTracking
 
-    classes: list[Any] = [data.Shards, MLflowTracking]
-    for module in (models, trainer.callbacks, trainer.losses, trainer.modules):
+    classes: list[Any] = [data.Shards, MLflowTracking, Critic]
+    for module in (models, trainer.callbacks, trainer.losses, trainer.modules, trainer.schedules):
         classes += [
             value
             for _, value in inspect.getmembers(module, inspect.isclass)
@@ -92,10 +94,15 @@ def explain(message: str, known: Iterable[str]) -> str:
     lines = [line.strip(" -\n") for line in message.splitlines() if line.strip()]
     text = " ".join(dict.fromkeys(lines))
     wrong = re.search(
-        r"(?:[Uu]nrecognized arguments: --|Option '|Key '|key \"|No such option '?)([\w.+]+)", text
+        r"(?:[Uu]nrecognized arguments: --|Option '|Key '|(?<!Parser )key \"|No such option '?)([\w.+]+)",
+        text,
     )
     if wrong is None:
-        return text
+        value = re.search(r"((?:Parser key \"[\w.]+\": )+)Expected (?:an? )?(.+?)\. Got value: (\S+)", text)
+        if value is None:
+            return text
+        option = ".".join(re.findall(r"\"([\w.]+)\"", value.group(1)))
+        return f"option {option!r}: expected {value.group(2)}, got {value.group(3)}"
     word = wrong.group(1)
     known = sorted(set(known))
     near = difflib.get_close_matches(word, TOP_LEVEL, n=1) if "." not in word else []
@@ -181,8 +188,13 @@ class TrainingCLI(LightningCLI):
                 c for c in config.trainer.callbacks or [] if c.class_path.endswith(keep)
             ]
 
+    def instantiate_classes(self) -> None:
+        """Build everything, and say early which options of the trainer have no effect."""
+        super().instantiate_classes()
+        check_manual(self.model, self.trainer)
+
     def _parse_ckpt_path(self) -> None:
-        """Compare the checkpoint's network with the configured one.
+        """Compare the checkpoint's network, and a critic that goes on training, with the configured ones.
 
         Lightning would silently replace the configuration by the checkpoint's.
 
@@ -191,18 +203,52 @@ class TrainingCLI(LightningCLI):
         """
         config = self.config[self.config.subcommand]
         if config.ckpt_path:
-            check_checkpoint(Path(config.ckpt_path), config.model.init_args.net)
+            arguments = config.model.init_args
+            check_checkpoint(
+                Path(config.ckpt_path), arguments.net,
+                critics=expected_critics(arguments) if self.config.subcommand == "fit" else None,
+            )  # fmt: skip
 
 
-def check_checkpoint(path: Path, net: Any) -> None:
-    """Raise a ValueError unless the checkpoint can be read and holds the configured network."""
+def check_manual(module: LightningModule, trainer: Trainer) -> None:
+    """Raise a ValueError where a module that optimises by hand has options of its own for the trainer's."""
+    if module.automatic_optimization:
+        return
+    name = type(module).__name__
+    if trainer.gradient_clip_val:
+        raise ValueError(
+            f"{name} clips the gradient of each network itself: "
+            f"use --model.gradient_clip {trainer.gradient_clip_val:g} and --trainer.gradient_clip_val null"
+        )
+    if trainer.accumulate_grad_batches != 1:
+        raise ValueError(
+            f"{name} accumulates gradients itself: use --model.accumulate {trainer.accumulate_grad_batches} "
+            "and --trainer.accumulate_grad_batches 1"
+        )
+
+
+def expected_critics(arguments: Any) -> str:
+    """Return the critic that a configuration trains with, described, or nothing where it has none."""
+    critic = arguments.get("critic")
+    return _described(critic.as_dict()) if critic and arguments.get("adversarial_weight") else ""
+
+
+def check_checkpoint(path: Path, net: Any, critics: str | None = None) -> None:
+    """Raise a ValueError unless the checkpoint can be read and holds what is configured.
+
+    Args:
+        path: The checkpoint.
+        net: The configured network.
+        critics: The configured critic, described; empty for a training without; None: does not matter.
+    """
     import pickle
 
     import torch
 
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        saved = checkpoint["hyper_parameters"]["net"]
+        arguments = checkpoint["hyper_parameters"]
+        saved = arguments["net"]
     except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a checkpoint: {str(error).splitlines()[0]}") from None
     except (KeyError, TypeError):
@@ -212,6 +258,13 @@ def check_checkpoint(path: Path, net: Any) -> None:
         raise ValueError(
             f"{path} holds {_described(saved)}, but the configuration asks for {_described(wanted)}; "
             "give the configuration that it was trained with"
+        )
+    critic = arguments.get("critic") if arguments.get("adversarial_weight") else None
+    held = _described(critic) if critic else ""
+    if critics is not None and held != critics:
+        raise ValueError(
+            f"{path} was trained with {held or 'no critic'}, but the configuration asks for "
+            f"{critics or 'none'}; give the configuration that it was trained with"
         )
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from trainer.schedules import OneCycle
+from trainer.schedules import Halving, OneCycle
 
 
 def rates(steps, **options):
@@ -63,3 +63,46 @@ def test_resuming_with_more_steps_stretches_the_cycle():
 def test_impossible_options_are_refused(options):
     with pytest.raises(ValueError, match="out of range"):
         rates(10, **options)
+
+
+def halving(counts, **options):
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
+    schedule = Halving(optimizer, **options)
+    found = []
+    for _ in range(counts):
+        found.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return found, schedule
+
+
+def test_rate_is_halved_after_each_milestone_as_in_the_paper_of_afgsa():
+    found, schedule = halving(12, milestones=[3, 6, 9])
+    assert found == pytest.approx([2.0] * 3 + [1.0] * 3 + [0.5] * 3 + [0.25] * 3)
+    assert schedule.interval == "epoch"
+
+
+def test_other_fraction_per_step_and_no_milestones():
+    found, schedule = halving(4, milestones=[2], per="step", factor=0.1)
+    assert found == pytest.approx([2.0, 2.0, 0.2, 0.2])
+    assert schedule.interval == "step"
+    assert halving(3)[0] == [2.0] * 3
+
+
+def test_restored_halving_continues_and_takes_new_milestones():
+    _, schedule = halving(4, milestones=[3, 6])
+    assert not {"milestones", "interval", "decay"} & set(schedule.state_dict())
+    again = Halving(torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0), [3, 5])
+    again.load_state_dict(schedule.state_dict())
+    assert again.get_last_lr() == [1.0]
+    again.optimizer.step()
+    again.step()
+    assert again.get_last_lr() == [0.5]
+
+
+@pytest.mark.parametrize(
+    "options", [{"milestones": [3, 2]}, {"milestones": [0]}, {"per": "batch"}, {"factor": 1.0}]
+)
+def test_impossible_halvings_are_refused(options):
+    with pytest.raises(ValueError, match=r"milestones must be ascending|expected epoch or step"):
+        halving(1, **options)
