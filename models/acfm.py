@@ -230,7 +230,7 @@ class ACFM(Denoiser):
         logs = self.predict(buffers)
         exposure = self.exposure(buffers).to(logs.diffuse.dtype)
         with torch.autocast(logs.diffuse.device.type, enabled=False):
-            diffuse, specular = (torch.expm1(log.clamp_max(LARGEST_LOG)) for log in logs)
+            diffuse, specular = (_radiance_of(log) for log in logs)
             return Denoised((divisor(buffers["albedo"]) * diffuse + specular) / exposure)
 
     def predict(self, buffers: Buffers) -> Logs:
@@ -308,6 +308,12 @@ def divisor(albedo: Tensor) -> Tensor:
 def _radiance(radiance: Tensor, exposure: Tensor) -> Tensor:
     """Return exposed radiance in [0, LARGEST]; what is no number counts as 0."""
     return torch.nan_to_num(_wide(radiance) * _wide(exposure), 0.0).clamp(0.0, LARGEST)
+
+
+def _radiance_of(log: Tensor) -> Tensor:
+    """Return exp(log) - 1 without cancellation near 0, of operations that ONNX has."""
+    bounded = log.clamp_max(LARGEST_LOG)
+    return torch.tanh(bounded / 2) * (torch.exp(bounded) + 1)
 
 
 def _finite(tensor: Tensor) -> Tensor:
