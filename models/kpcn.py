@@ -24,6 +24,9 @@ and they differ; here:
   arithmetic on small crops;
 - border of the gather: mirrored (Han), so that a constant image stays constant; `border="zero"` is SBMC's,
   where the outside is black and takes weight;
+- what the network sees is clipped to +-1000 (`feature_limit`), what is filtered is not. Published features
+  have no bound: a firefly on a dark surface makes logits so large that float32 rounds them by more than the
+  kernels bear, and an exported file differs from the module by 2e-4 where the bound leaves 2e-5;
 - `exposure` is ours: radiance is multiplied by it first (variance by its square) and the result divided, so
   that scenes in other units look alike;
 - `branches="single"`: one network for data whose light is not split, in either of the two transforms.
@@ -51,8 +54,7 @@ EPSILON = 0.00316
 """Added to the albedo before dividing by it and before multiplying."""
 
 LARGEST = 1e10
-"""Bound of radiance, variances and features: far above any of a render, it keeps float32 from overflowing in
-the network and its gradients when a pixel is a firefly of 1e9 or infinite."""
+"""Bound of radiance and variances: far above any of a render, it keeps infinite pixels from making NaN."""
 
 SIZE = 5
 """Rows and columns of a convolution."""
@@ -135,6 +137,7 @@ class KPCN(Denoiser):
         transform: Of the single branch: log(1 + color), or `demodulated`, divided by the albedo.
         sbmc_compat: Variance of logarithms as in SBMC's code, with its slip.
         padding: Zeros around the features once, or before every one of the `layers`.
+        feature_limit: Features are clipped to +-this.
 
     Raises:
         ValueError: An argument is out of range; the message names it.
@@ -154,6 +157,7 @@ class KPCN(Denoiser):
         transform: Transform = "log",
         sbmc_compat: bool = False,
         padding: Literal["features", "layers"] = "features",
+        feature_limit: float = 1000.0,
     ) -> None:
         super().__init__()
         _check_choice("branches", branches, ("split", "single"))
@@ -165,7 +169,9 @@ class KPCN(Denoiser):
             raise ValueError(f"kernel_size must be odd and at least 3, got {kernel_size}")
         if layers < 2 or width < 1:
             raise ValueError(f"KPCN needs at least 2 layers and width 1, got {layers} and {width}")
-        self.features, self.sbmc_compat = features, sbmc_compat
+        if not 0 < feature_limit <= LARGEST:
+            raise ValueError(f"feature_limit must lie between 0 and {LARGEST:g}, got {feature_limit}")
+        self.features, self.sbmc_compat, self.feature_limit = features, sbmc_compat, feature_limit
         self.transforms: dict[str, Transform] = {"color": transform}
         if branches == "split":
             self.transforms = {"diffuse": "demodulated", "specular": "log"}
@@ -224,7 +230,7 @@ class KPCN(Denoiser):
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of whole frames."""
-        depth = _finite(buffers["depth"].detach(), 0.0, 0.0)
+        depth = _finite(buffers["depth"].detach(), 0.0)
         return {"depth_range": torch.stack([depth.amin((1, 2, 3)), depth.amax((1, 2, 3))], 1)}
 
     def network_input(self, buffers: Buffers) -> dict[str, Tensor]:
@@ -248,9 +254,9 @@ class KPCN(Denoiser):
             clean[light] = (_radiance(wide[light]) * exposure).clamp_max(LARGEST)
             variance = _radiance(wide[f"{light}_variance"]) * exposure.square()
             clean[f"{light}_variance"] = variance.clamp_max(LARGEST)
-        clean["albedo"] = _finite(wide["albedo"], 1.0, 1.0).clamp_min(0.0)
-        clean["normal"] = _finite(wide["normal"], 0.0, 0.0)
-        depth = _finite(wide["depth"], 0.0, 0.0)
+        clean["albedo"] = _finite(wide["albedo"], 1.0).clamp_min(0.0)
+        clean["normal"] = _finite(wide["normal"], 0.0)
+        depth = _finite(wide["depth"], 0.0)
         given = wide.get("depth_range")
         bounds = self.measure(wide)["depth_range"] if given is None else given
         largest = bounds[:, 1, None, None, None]
@@ -275,7 +281,7 @@ class KPCN(Denoiser):
         """Return exposed radiance."""
         color: Tensor | None = None
         for image, transform in zip(filtered.values(), self.transforms.values(), strict=True):
-            light = torch.expm1(image) if transform == "log" else image * (clean["albedo"] + EPSILON)
+            light = _exp_minus_one(image) if transform == "log" else image * (clean["albedo"] + EPSILON)
             color = light if color is None else color + light
         assert color is not None
         return color
@@ -298,20 +304,27 @@ class KPCN(Denoiser):
             spread = variance.mean(1, keepdim=True) / (slope.square().mean(1, keepdim=True) + least)
             parts = [image, normal, means["normal"], depth, means["depth"], albedo]
             parts += [clean["albedo_variance"].mean(1, keepdim=True), backward_differences(image), spread]
-        return torch.cat(parts, 1).clamp(-LARGEST, LARGEST)
+        return torch.cat(parts, 1).clamp(-self.feature_limit, self.feature_limit)
 
 
 def _transformed(clean: Buffers, light: str, transform: Transform) -> Tensor:
     return torch.log1p(clean[light]) if transform == "log" else clean[light] / (clean["albedo"] + EPSILON)
 
 
-def _finite(image: Tensor, nan: float, infinite: float) -> Tensor:
-    return torch.nan_to_num(image, nan=nan, posinf=infinite, neginf=0.0)
+def _exp_minus_one(image: Tensor) -> Tensor:
+    """Return exp(x) - 1, precise near 0; ONNX has no operator for it."""
+    if torch.onnx.is_in_onnx_export():
+        return (torch.exp(image) + 1) * torch.tanh(image / 2)
+    return torch.expm1(image)
+
+
+def _finite(image: Tensor, otherwise: float) -> Tensor:
+    return torch.where(torch.isnan(image) | torch.isinf(image), otherwise, image)
 
 
 def _radiance(image: Tensor) -> Tensor:
-    """Return radiance or variance, finite and not negative."""
-    return _finite(image, 0.0, LARGEST).clamp(0.0, LARGEST)
+    """Return radiance or variance, finite and not negative; infinite becomes `LARGEST`."""
+    return torch.where(torch.isnan(image), 0.0, image).clamp(0.0, LARGEST)
 
 
 def _check_choice(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -1,7 +1,7 @@
 """KPCN written down step by step from its description: the reference that tests and benchmarks compare with.
 
-Nothing of the product's code is used: loops over channels, `unfold` for the kernels, convolutions without padding
-on features that were padded once.
+Nothing of the product's code is used: loops over channels, `unfold` for the kernels, convolutions without
+padding on features that were padded once.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ pytestmark = [
 
 
 class Split(Dataset):
-    """Twelve patches whose light is split. All batches of four are the same, for runs that resume anywhere."""
+    """Twelve patches whose light is split. Batches of four are all the same, wherever a run resumes."""
 
     def __len__(self):
         return 12
