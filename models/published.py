@@ -77,18 +77,24 @@ def _load_afgsa(weights: Mapping[str, Tensor]) -> AFGSA:
     """Entries: conv<k>.0, conv_map.0, conv_a<k>.0, conv_aenc<1, 2>.0, transformer_blocks.<i>…, decoder.<i>.0.
 
     Width, kernel sizes and blocks are read from the names and shapes. Heads, of half the channels of a row
-    table each, are too; blocks have a halo of 3 and the rest of the table's length.
+    table each, are too; blocks and halo are those of the paper with tables of this length.
     """
     table = weights.get("transformer_blocks.0.attention.rel_h")
     if table is None or table.ndim != 4 or "conv_map.0.weight" not in weights:
         listed = ", ".join(list(weights)[:5]) or "nothing"
         raise ValueError(f"afgsa: not the entries of the authors' generator (conv1.0.weight …); got {listed}")
+    if table.shape[1] not in _AFGSA_WINDOWS:
+        raise ValueError(
+            f"afgsa: windows of {table.shape[1]} pixels are not the authors'; expected "
+            f"{' or '.join(map(str, _AFGSA_WINDOWS))}"
+        )
+    block, halo = _AFGSA_WINDOWS[table.shape[1]]
     width = weights["conv_map.0.weight"].shape[0]
     sizes = sorted(int(m[1]) for m in (re.fullmatch(r"conv(\d+)\.0\.weight", key) for key in weights) if m)
     blocks = len({key.split(".")[1] for key in weights if key.startswith("transformer_blocks.")})
     network = AFGSA(
         width=width, blocks=blocks, heads=width // (2 * table.shape[3]), kernel_sizes=sizes,
-        block=table.shape[1] - 6, halo=3,
+        block=block, halo=halo,
     )  # fmt: skip
     targets = network.state_dict()
     names = {_authors_name(key, sizes): key for key in targets}
@@ -126,6 +132,9 @@ def _copy(name: str, source: Tensor, target: Tensor) -> None:
     with torch.no_grad():
         target.copy_(source)
 
+
+_AFGSA_WINDOWS = {14: (8, 3), 26: (16, 5)}
+"""Blocks and halos of the paper by the side of the window that they make."""
 
 _KIND = "(?P<kind>weight|bias)"
 _BLOCK = r"blocks\.(?P<block>\d+)\."

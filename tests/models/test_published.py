@@ -17,7 +17,8 @@ from torch import Tensor
 
 from models import WSKP
 from models.published import load_published
-from tests.models.frames import largest_relative, random_buffers
+from tests.models.frames import largest_relative, random_buffers, split_buffers
+from tests.models.plain_afgsa import PlainAFGSA
 
 SHARED = Path(__file__).parents[3] / "shared"
 CHECKPOINTS = ["classroom", "livingroom", "san-miguel", "sponza", "sponza-glossy", "sponza-moving-light"]
@@ -151,6 +152,112 @@ def test_weights_of_another_network_are_refused() -> None:
         load_published("wskp", WSKP().state_dict())
 
 
+def authors_afgsa(width: int = 16, blocks: int = 2) -> dict[str, Tensor]:
+    """Random weights of AFGSA's generator in the authors' names."""
+    torch.manual_seed(0)
+    return PlainAFGSA(width, blocks, 2).state_dict()
+
+
+def afgsa_entries() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the authors' generator, written down."""
+    entries: dict[str, tuple[int, ...]] = {}
+
+    def convolution(name: str, outputs: int, inputs: int, size: int) -> None:
+        entries[f"{name}.weight"] = (outputs, inputs, size, size)
+        entries[f"{name}.bias"] = (outputs,)
+
+    for size in (1, 3, 5):
+        convolution(f"conv{size}.0", 256, 3, size)
+        convolution(f"conv_a{size}.0", 256, 7, size)
+    convolution("conv_map.0", 256, 768, 1)
+    convolution("conv_aenc1.0", 256, 768, 1)
+    convolution("conv_aenc2.0", 256, 256, 1)
+    for block in range(5):
+        attention = f"transformer_blocks.{block}.attention"
+        entries |= {f"{attention}.rel_h": (1, 14, 1, 32), f"{attention}.rel_w": (1, 1, 14, 32)}
+        entries |= {f"{attention}.{letter}_conv.weight": (256, 256, 1, 1) for letter in "qkv"}
+        convolution(f"{attention}.conv_map.0", 256, 512, 1)
+        for layer in (0, 1):
+            convolution(f"transformer_blocks.{block}.feed_forward.{layer}.0", 256, 256, 3)
+    for layer, outputs in enumerate((256, 256, 3)):
+        convolution(f"decoder.{layer}.0", outputs, 256, 3)
+    return entries
+
+
+def test_afgsa_takes_the_79_entries_of_the_authors() -> None:
+    entries = afgsa_entries()
+    assert len(entries) == 79
+    assert entries == {name: tuple(t.shape) for name, t in PlainAFGSA().state_dict().items()}
+    network = load_published("afgsa", {name: torch.full(shape, 0.5) for name, shape in entries.items()})
+    assert all(bool((p == 0.5).all()) for p in network.parameters())
+    assert sum(p.numel() for p in network.parameters()) == 9_282_691
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the development data is not there")
+def test_afgsas_entries_are_those_of_the_authors_code() -> None:
+    lines = (SHARED / "published/statedict_afgsa.txt").read_text().split("## DISCRIMINATOR")[0].splitlines()
+    pairs = [line.split("\t") for line in lines if "\t" in line]
+    shapes = {name: tuple(int(n) for n in re.findall(r"\d+", shape)) for name, shape in pairs}
+    assert shapes == afgsa_entries()
+
+
+@pytest.mark.parametrize("wrapper", [None, "model_state_dict", "state_dict"])
+def test_afgsa_with_the_authors_weights_gives_their_output(wrapper: str | None) -> None:
+    torch.manual_seed(4)
+    plain = PlainAFGSA(16, 3, 2)
+    weights = plain.state_dict()
+    network = load_published("afgsa", weights if wrapper is None else {wrapper: weights})
+    assert (len(network.blocks), network.halo, network.training) == (3, 29, False)
+    buffers = split_buffers(2, 16, 24)
+    depth = buffers["depth"] / buffers["depth"].amax((1, 2, 3), keepdim=True)
+    aux = torch.cat([buffers["normal"] / 2 + 0.5, depth, buffers["albedo"]], 1)
+    with torch.no_grad():
+        log = plain(torch.log1p(buffers["color"]), aux)
+        assert largest_relative(network.predict(buffers), log) < 1e-5
+        assert largest_relative(network(buffers).color, torch.expm1(log).clamp_min(0)) < 1e-5
+
+
+def test_names_that_parallel_training_prefixed_are_taken() -> None:
+    weights = authors_afgsa()
+    plain = load_published("afgsa", weights)
+    prefixed = load_published("afgsa", {f"module.{name}": value for name, value in weights.items()})
+    assert all(torch.equal(a, b) for a, b in zip(plain.parameters(), prefixed.parameters(), strict=True))
+
+
+def test_a_missing_entry_of_afgsa_is_named() -> None:
+    weights = authors_afgsa()
+    del weights["transformer_blocks.1.attention.q_conv.weight"]
+    with pytest.raises(ValueError, match=r"afgsa: missing transformer_blocks\.1\.attention\.q_conv\.weight"):
+        load_published("afgsa", weights)
+
+
+def test_an_unexpected_entry_of_afgsa_is_named() -> None:
+    with pytest.raises(ValueError, match=r"afgsa: unexpected decoder\.3\.0\.weight"):
+        load_published("afgsa", {**authors_afgsa(), "decoder.3.0.weight": torch.zeros(3)})
+
+
+def test_an_entry_of_afgsa_of_another_shape_is_named() -> None:
+    wrong = {**authors_afgsa(), "decoder.0.0.bias": torch.zeros(17)}
+    with pytest.raises(ValueError, match=r"decoder\.0\.0\.bias has shape \(17,\), expected \(16,\)"):
+        load_published("afgsa", wrong)
+
+
+def test_weights_of_another_network_are_refused_as_afgsas() -> None:
+    with pytest.raises(ValueError, match="afgsa: not the entries of the authors' generator"):
+        load_published("afgsa", WSKP().state_dict())
+
+
+def test_windows_of_the_papers_larger_blocks_are_recognised() -> None:
+    torch.manual_seed(0)
+    network = load_published("afgsa", PlainAFGSA(8, 1, 1, block=16, halo=5).state_dict())
+    assert (network.multiple, network.halo) == (16, 23)
+    with pytest.raises(
+        ValueError, match="afgsa: windows of 10 pixels are not the authors'; expected 14 or 26"
+    ):
+        load_published("afgsa", PlainAFGSA(8, 1, 1, block=4, halo=3).state_dict())
+
+
 def test_an_unknown_method_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="'afgsa'; known: wskp"):
-        load_published("afgsa", {})
+    with pytest.raises(ValueError, match="'afgsb'; known: wskp, afgsa"):
+        load_published("afgsb", {})  # type: ignore[call-overload]
