@@ -189,6 +189,8 @@ class ACFM(Denoiser):
     frame_numbers = ("exposure", "depth_range")
     targets = ("reference", "reference_diffuse")
     compared = ("diffuse", "specular")
+    # PyTorch's allocator peaks at 1,530; the rest is room for oneDNN and for exported forms, which modulate
+    # whole images.
     bytes_per_pixel = 2600
 
     def __init__(
