@@ -21,7 +21,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -96,8 +96,8 @@ def _from_path(path: Path, device: str) -> Loaded:
     source = Source(reference=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
     if "hyper_parameters" in checkpoint:
         denoiser, source = _from_training(checkpoint, path, source)
-    elif "model_state_dict" in checkpoint:
-        denoiser, source = _from_authors(checkpoint["model_state_dict"], path, source)
+    elif method := _published_method(checkpoint):
+        denoiser, source = _from_authors(method, checkpoint, path, source)
     else:
         held = ", ".join(map(str, list(checkpoint)[:6])) or "nothing"
         raise ValueError(
@@ -216,11 +216,24 @@ def _fill(denoiser: Denoiser, weights: dict[str, Any], path: Path) -> None:
         ) from error
 
 
-def _from_authors(weights: Mapping[str, Any], path: Path, source: Source) -> tuple[Denoiser, Source]:
+def _published_method(checkpoint: Mapping[str, Any]) -> Literal["wskp", "afgsa"] | None:
+    """Return whose published checkpoint this is by the names of its entries, None where it is none."""
+    inner: Any = checkpoint
+    for wrapper in ("model_state_dict", "state_dict"):
+        inner = inner.get(wrapper, inner) if isinstance(inner, Mapping) else inner
+    names = {str(name).removeprefix("module.").split(".")[0] for name in inner}
+    if names & {"conv_map", "conv_aenc1", "transformer_blocks"}:
+        return "afgsa"
+    return "wskp" if "conv1_5" in names or "model_state_dict" in checkpoint else None
+
+
+def _from_authors(
+    method: Literal["wskp", "afgsa"], checkpoint: Mapping[str, Any], path: Path, source: Source
+) -> tuple[Denoiser, Source]:
     from models.published import load_published
 
     try:
-        denoiser = load_published("wskp", weights)
+        denoiser: Denoiser = load_published(method, checkpoint)
     except (ValueError, KeyError, RuntimeError) as error:
         raise ValueError(f"{path} is not a published checkpoint that Penumbra knows: {error}") from error
     return denoiser, replace(source, class_path=f"models.{type(denoiser).__name__}")

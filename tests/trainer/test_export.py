@@ -16,6 +16,7 @@ from torch import Tensor, nn
 import models
 from models import WSKP
 from models.denoiser import Buffers, Denoised, Denoiser
+from tests.conformance.test_denoisers import make
 from trainer.commands import export as command
 from trainer.export import SUFFIXES, Source, export, load_artifact
 from trainer.export.description import KEY, Description
@@ -168,6 +169,21 @@ def test_a_denoiser_without_frame_numbers_or_parameters_is_exported(tmp_path: Pa
 def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, format: str) -> None:
     net = models.JointBilateral(radius=2)
     assert export(net, tmp_path / "net.bin", format).error <= LIMIT  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"}))
+def test_every_network_is_exported_and_takes_any_size(tmp_path: Path, name: str, format: str) -> None:
+    torch.manual_seed(3)
+    net = make(name)
+    path = tmp_path / f"net{SUFFIXES[format]}"
+    export(net, path, format)  # type: ignore[arg-type]
+    artifact = load_artifact(path)
+    for size in ((2, 37, 29), (1, 16, 50)):
+        buffers = buffers_of(net, *size)
+        with torch.inference_mode():
+            expected = net(buffers).color
+        assert relative_error(artifact(buffers).color, expected) < LIMIT
 
 
 def test_export_leaves_the_denoiser_as_it_was(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from torch import nn
 import models
 from models import WSKP
 from models.denoiser import Buffers, Denoised, Denoiser
+from tests.models.test_published import authors_afgsa
 from trainer.export import Artifact, Source, export
 from trainer.export.entry import example
 from trainer.export.register import log_and_register, using_store
@@ -200,6 +201,27 @@ def test_an_unknown_authors_checkpoint_is_an_error(tmp_path: Path) -> None:
     torch.save({"model_state_dict": {"a": torch.zeros(3)}}, tmp_path / "authors.pt")
     with pytest.raises(ValueError, match="not a published checkpoint that Penumbra knows"):
         load_model(str(tmp_path / "authors.pt"))
+
+
+@pytest.mark.parametrize("wrapper", [None, "state_dict", "model_state_dict"])
+def test_the_checkpoint_of_afgsas_authors_is_known_by_its_entries(
+    tmp_path: Path, wrapper: str | None
+) -> None:
+    weights = {f"module.{name}": value for name, value in authors_afgsa().items()}
+    torch.save(weights if wrapper is None else {wrapper: weights, "epoch": 12}, tmp_path / "G.pth")
+    loaded = resolve(str(tmp_path / "G.pth"))
+    assert isinstance(loaded.model, models.AFGSA)
+    assert loaded.source.class_path == "models.AFGSA"
+    assert not loaded.model.training
+    assert not any(parameter.requires_grad for parameter in loaded.model.parameters())
+
+
+def test_a_damaged_checkpoint_of_afgsas_authors_is_a_clear_error(tmp_path: Path) -> None:
+    weights = authors_afgsa()
+    del weights["conv_aenc2.0.bias"]
+    torch.save(weights, tmp_path / "G.pth")
+    with pytest.raises(ValueError, match=r"G\.pth is not a published .*afgsa: missing conv_aenc2\.0\.bias"):
+        load_model(str(tmp_path / "G.pth"))
 
 
 @pytest.mark.shared
