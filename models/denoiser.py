@@ -57,6 +57,7 @@ class Denoiser(nn.Module):
         temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
         per_sample: Buffers carry a sample axis (B, S, C, H, W).
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
+        bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         targets: Names of the buffers that training compares with.
         compared: Names of the pairs that `training_pairs` returns.
     """
@@ -68,6 +69,7 @@ class Denoiser(nn.Module):
     temporal: bool = False
     per_sample: bool = False
     bytes_per_pixel: int = 500
+    bytes_once: int = 0
     targets: tuple[str, ...] = ("reference",)
     compared: tuple[str, ...] = ("color",)
 

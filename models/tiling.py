@@ -6,7 +6,6 @@ numbers that need the whole frame are measured once. Tiled equals untiled to rou
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -21,6 +20,9 @@ BYTES_PER_PIXEL = 500
 """Working memory per pixel where a method does not declare `bytes_per_pixel`: ONNX Runtime was measured to
 take 410 for WSKP at 1280x720."""
 
+SMALLEST_CORE = 16
+"""Rows and columns of the smallest core: below that nearly all work would be halo."""
+
 DEFAULT_BUDGET = 2 * 1024**3
 """Working memory in bytes where the caller names none: four million pixels in one piece."""
 
@@ -28,7 +30,7 @@ DEFAULT_BUDGET = 2 * 1024**3
 class Tileable(Protocol):
     """What tiling needs of a denoiser; exported artifacts offer the same.
 
-    A method may also declare `bytes_per_pixel`, its measured working memory.
+    A method may also declare `bytes_per_pixel` and `bytes_once`, its measured working memory.
     """
 
     @property
@@ -67,28 +69,46 @@ class Tile:
     read: tuple[slice, slice]
 
 
-def tile_size(denoiser: Tileable, budget: int, batch: int = 1) -> int:
-    """Return the side of the largest square core whose tile, halo included, fits into a memory budget.
+def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int = 1) -> tuple[int, int]:
+    """Return the rows and columns of the cores that fit into a memory budget and read the fewest pixels.
+
+    Halos are read again by every tile, but not beyond the image, so long tiles along the shorter side often
+    read less than square ones.
 
     Args:
-        denoiser: Declares `halo`, `multiple` and optionally `bytes_per_pixel`.
+        denoiser: Declares `halo`, `multiple` and optionally `bytes_per_pixel` and `bytes_once`.
+        size: Height and width of the image, multiples of `multiple`.
         budget: Working memory in bytes.
         batch: Images that are denoised at once.
 
     Raises:
-        ValueError: Not even one multiple of pixels fits; the message says how much is needed.
+        ValueError: Not even the smallest tile fits; the message says how much is needed.
     """
     per_pixel = int(getattr(denoiser, "bytes_per_pixel", BYTES_PER_PIXEL)) * batch
+    once = int(getattr(denoiser, "bytes_once", 0))
     halo, multiple = _aligned_halo(denoiser), denoiser.multiple
-    core = (math.isqrt(budget // per_pixel) - 2 * halo) // multiple * multiple
-    smallest = max(multiple, 16)
-    if core < smallest:
-        needed = (smallest + 2 * halo) ** 2 * per_pixel
+    (tall, wide), pixels = size, max(budget - once, 0) // per_pixel
+    smallest = _round_up(SMALLEST_CORE, multiple)
+    found: list[tuple[int, tuple[int, int]]] = []
+    for pieces in range(1, -(-tall // smallest) + 1):
+        rows = _even(tall, -(-tall // pieces), multiple)
+        room = pixels // min(rows + 2 * halo, tall)
+        columns = wide if room >= wide else (room - 2 * halo) // multiple * multiple
+        if columns >= min(smallest, wide):
+            columns = _even(wide, columns, multiple)
+            found.append((_read(tall, rows, halo) * _read(wide, columns, halo), (rows, columns)))
+    if not found:
+        height, width = (min(smallest + 2 * halo, side) for side in size)
         raise ValueError(
             f"a memory budget of {budget / 1e6:.1f} MB is too small for tiles with a halo of {halo} pixels: "
-            f"expected at least {needed / 1e6:.1f} MB"
+            f"expected at least {(height * width * per_pixel + once) / 1e6:.1f} MB"
         )
-    return core
+    return min(found)[1]
+
+
+def _read(size: int, core: int, halo: int) -> int:
+    """Return how many rows (or columns) all tiles along a side read together."""
+    return sum(min(size, start + core + halo) - max(0, start - halo) for start in range(0, size, core))
 
 
 def tiles(height: int, width: int, core: tuple[int, int], halo: int) -> Iterator[Tile]:
@@ -136,11 +156,13 @@ def denoise_tiled(
     numbers = {name: buffers[name] for name in denoiser.frame_numbers if name in buffers}
     numbers = {**denoiser.measure(buffers), **numbers}
     multiple = denoiser.multiple
-    largest = tile_size(denoiser, budget, batch) if tile is None else max(tile, 1)
     images = {name: _padded(buffers[name], multiple) for name in denoiser.inputs}
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
     result: Tensor | None = None
-    core = (_even(tall, largest, multiple), _even(wide, largest, multiple))
+    if tile is None:
+        core = core_size(denoiser, (tall, wide), budget, batch)
+    else:
+        core = (_even(tall, max(tile, 1), multiple), _even(wide, max(tile, 1), multiple))
     for piece in tiles(tall, wide, core, _aligned_halo(denoiser)):
         rows, columns = piece.read
         part = {name: image[..., rows, columns].contiguous() for name, image in images.items()}

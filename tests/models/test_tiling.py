@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import pytest
@@ -10,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from models import WSKP
-from models.tiling import denoise_tiled, tile_size, tiles
+from models.tiling import core_size, denoise_tiled, tiles
 from tests.models.frames import largest_relative, random_buffers
 
 
@@ -82,12 +83,42 @@ def test_cores_cover_every_pixel_once() -> None:
     assert (covered == 1).all()
 
 
-def test_tiles_fit_the_budget_and_use_it() -> None:
+class Wide(WSKP):
+    """WSKP with a large lasting allocation."""
+
+    bytes_once = 15_000_000
+
+
+@pytest.mark.parametrize("network", [WSKP(), Wide()])
+@pytest.mark.parametrize("budget", [20_000_000, 60_000_000])
+def test_tiles_fit_the_budget_and_use_it(network: WSKP, budget: int) -> None:
+    rows, columns = core_size(network, (720, 1280), budget)
+    halo = -(-network.halo // network.multiple) * network.multiple
+
+    def needed(rows: int, columns: int) -> int:
+        pieces = tiles(720, 1280, (rows, columns), halo)
+        areas = [(r.stop - r.start) * (c.stop - c.start) for r, c in (piece.read for piece in pieces)]
+        return max(areas) * network.bytes_per_pixel + network.bytes_once
+
+    assert needed(rows, columns) <= budget
+    assert needed(2 * rows, 2 * columns) > budget
+    assert needed(720, columns) > budget or rows == 720
+
+
+def test_cores_read_no_more_pixels_than_square_ones_do() -> None:
     network = WSKP()
-    for budget in (20_000_000, 300_000_000):
-        side = tile_size(network, budget) + 2 * network.halo
-        assert side**2 * network.bytes_per_pixel <= budget
-        assert (side + 1) ** 2 * network.bytes_per_pixel > budget
+    budget = 30_000_000
+
+    def read(core: tuple[int, int]) -> int:
+        pieces = [piece.read for piece in tiles(720, 1280, core, network.halo)]
+        return sum((r.stop - r.start) * (c.stop - c.start) for r, c in pieces)
+
+    side = math.isqrt(budget // network.bytes_per_pixel) - 2 * network.halo
+    assert read(core_size(network, (720, 1280), budget)) < read((side, side))
+
+
+def test_an_image_that_fits_is_one_tile() -> None:
+    assert core_size(WSKP(), (720, 1280), 720 * 1280 * WSKP.bytes_per_pixel) == (720, 1280)
 
 
 def test_a_budget_too_small_for_one_tile_says_how_much_is_needed() -> None:
