@@ -23,6 +23,7 @@ from rich.table import Table
 MODULES = (
     *("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality"),
     *("rendering", "procedural"),
+    *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "stills_quality"),
 )
 RESULTS = Path("bench") / "results.json"
 
