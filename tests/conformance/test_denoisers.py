@@ -18,6 +18,10 @@ from tests.models.frames import largest_relative, lit, luminous, split_buffers
 KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral"}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
+CLEANING = {"ACFM", "AFGSA", "KPCN"}
+"""Methods that take radiance which is negative, infinite or not a number; the data module repairs it for the
+others."""
+
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "AFGSA": {"width": 16, "blocks": 2, "heads": 2},
     "KPCN": {"width": 8, "layers": 3, "kernel_size": 7},
@@ -112,7 +116,20 @@ def extreme(kind: str, denoiser: Denoiser, seed: int = 0) -> dict[str, Tensor]:
     if kind == "one firefly in black":
         noisy = torch.zeros_like(noisy)
         noisy[..., 9, 11] = 1e9
+    if kind == "no normals and no depth":
+        whole |= {name: torch.zeros_like(whole[name]) for name in ("normal", "depth")}
+        whole["depth_range"] = torch.zeros_like(whole["depth_range"])
     return select(denoiser, lit({**whole, "irradiance": noisy}))
+
+
+def damaged(denoiser: Denoiser) -> dict[str, Tensor]:
+    """Inputs with radiance that no renderer should write: not a number, infinite, negative."""
+    buffers = inputs(denoiser)
+    for key in denoiser.inputs:
+        if buffer(key.removesuffix("_variance")).kind == "radiance":
+            image = buffers[key] = buffers[key].clone()
+            image[..., 3, 4], image[..., 5, 30], image[..., 20:23, 7] = torch.nan, torch.inf, -0.5
+    return buffers
 
 
 def radiance(denoiser: Denoiser) -> str:
@@ -121,7 +138,9 @@ def radiance(denoiser: Denoiser) -> str:
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("kind", ["black", "bright", "fireflies", "one firefly in black"])
+@pytest.mark.parametrize(
+    "kind", ["black", "bright", "fireflies", "one firefly in black", "no normals and no depth"]
+)
 def test_extreme_inputs_stay_finite_with_finite_gradients(
     denoiser: Denoiser, kind: str, precision: str
 ) -> None:
@@ -133,6 +152,20 @@ def test_extreme_inputs_stay_finite_with_finite_gradients(
     if any(True for _ in denoiser.parameters()):
         color.mean().backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in denoiser.parameters())
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_damaged_radiance_gives_finite_images_where_the_network_cleans_its_input(
+    denoiser: Denoiser, name: str, precision: str
+) -> None:
+    if name not in CLEANING:
+        return
+    with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
+        color = denoiser(damaged(denoiser)).color
+    assert color.isfinite().all()
+    assert (color >= 0).all()
+    color.clamp_max(1e4).mean().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in denoiser.parameters())
 
 
 def test_every_parameter_has_a_gradient(denoiser: Denoiser) -> None:
