@@ -15,6 +15,9 @@ The authors' code is followed, the paper names few sizes. Where the code contrad
 - depth is divided by the largest of the crop in training and of the image in testing; here always of the
   frame (`depth_scale="crop"` gives the training's);
 - its test leaves the components apart; here they are put together as the paper says;
+- parameter groups: the paper's modulations and condition network learn at five times the rate. The code picks
+  them by the letters CFM in their names, which all layers between head and tail have, so its fast group has
+  those convolutions, too (`groups="published"`), and the frozen one only head and tail;
 - the last layer ends in a ReLU. With random weights every other of its three channels is negative for most
   pixels, which then give it no gradient. The weights start as the authors' (Kaiming normal, times 0.1, no
   biases), but the sign of each channel's last ones is chosen such that a grey image gives a positive value;
@@ -23,8 +26,8 @@ The authors' code is followed, the paper names few sizes. Where the code contrad
   reference's colour over the noisy albedo, which makes the product, not the quotient, right.
 `exposure` is ours: 1 for the authors' data, other data is brought to a displayable level first.
 
-Published, 32 spp, Tungsten scenes, by AFGSA's authors (Yu et al. 2021, Table 1): 37.446 dB PSNR, 0.002383
-"RMSE" (half the relative squared error), 0.0446 1 - SSIM; retrained by them 37.514 dB, 0.002369 and 0.0443.
+Published, 32 spp, Tungsten scenes, by AFGSA's authors (Yu et al. 2021, Table 1): 37.4461 dB PSNR, 2.383e-3
+"RMSE" (half the relative squared error), 0.0446 1 - SSIM; retrained by them 37.5137 dB, 2.369e-3 and 0.0443.
 """
 
 from __future__ import annotations
@@ -38,16 +41,14 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from models.denoiser import Buffers, Denoised, Denoiser, Pair
+from models.ops.boxes import exporting
+from models.ops.guides import depth_range, divisor, finite, relative_depth, unit_normal
 from models.ops.modulation import SLOPE, Weights, modulated_convolution, plain_modulated_convolution
+from models.ops.precision import wide
+from models.ops.tonemap import exposed, radiance_of
 
-ALBEDO_OFFSET = 0.00316
-"""Added to the albedo before dividing by it."""
 GUIDES = 7
 """Channels of the condition: normal 3, depth 1, albedo 3."""
-LARGEST = 1e12
-"""Exposed radiance is cut here, so that its logarithm and products stay finite."""
-LARGEST_LOG = 40.0
-"""The networks' results are cut here before exp, which overflows at 88."""
 
 
 class Logs(NamedTuple):
@@ -85,7 +86,7 @@ class Modulated(nn.Module):
     def forward(self, maps: Tensor, condition: Tensor) -> Tensor:
         """Return (B, width, H, W) from x of that shape and the condition (B, condition, H, W)."""
         weights = Weights(*self.parameters())  # modulation first, scale before shift
-        if _exporting():
+        if exporting():
             return plain_modulated_convolution(maps, condition, weights)
         return modulated_convolution(maps, condition, weights)
 
@@ -138,7 +139,7 @@ class Generator(nn.Module):
         """
         condition = self.condition(guides)
         head = maps = self.head(component)
-        repeat = torch.is_grad_enabled() and not _exporting()
+        repeat = torch.is_grad_enabled() and not exporting()
         for index, block in enumerate(self.blocks):
             if repeat and index < self.checkpointed:
                 maps = checkpoint(block, maps, condition, use_reentrant=False, preserve_rng_state=False)
@@ -147,8 +148,7 @@ class Generator(nn.Module):
         maps = functional.relu(self.tail(self.body(maps, condition).add_(head)), inplace=True)
         with torch.autocast(maps.device.type, enabled=False):
             # A logarithm with the 8 bits of bfloat16 would be radiance in steps of a per cent.
-            maps = maps if maps.dtype == torch.float64 else maps.float()
-            return functional.relu(self.last(maps))
+            return functional.relu(self.last(wide(maps)))
 
     def start(self, factor: float) -> None:
         """Draw the weights: Kaiming normal times `factor`, no biases, no output that is dead for grey."""
@@ -180,6 +180,7 @@ class ACFM(Denoiser):
         condition: Channels that it hands to the modulations.
         normal_range: `unit`: normals as [0, 1] for both networks; `published`: the diffuse one sees [-1, 1].
         depth_scale: Depth is divided by the largest of the `frame`, or, in training, of the `crop`.
+        groups: Which parameters are in the fast group: `modulation` as the paper says, or `published`.
         start: Factor on the random weights at the start.
         checkpointed: Blocks of each network whose inside is computed again in the backward pass instead
             of being kept.
@@ -201,6 +202,7 @@ class ACFM(Denoiser):
         condition: int = 32,
         normal_range: Literal["unit", "published"] = "unit",
         depth_scale: Literal["frame", "crop"] = "frame",
+        groups: Literal["modulation", "published"] = "modulation",
         start: float = 0.1,
         checkpointed: int = 0,
     ) -> None:
@@ -209,12 +211,10 @@ class ACFM(Denoiser):
         for name, value in {"blocks": blocks + 1, **sizes}.items():
             if value < 1:
                 raise ValueError(f"ACFM: {name} is too small, got {value - (name == 'blocks')}")
-        if normal_range not in ("unit", "published"):
-            raise ValueError(f"normal_range must be 'unit' or 'published', got {normal_range!r}")
-        if depth_scale not in ("frame", "crop"):
-            raise ValueError(f"depth_scale must be 'frame' or 'crop', got {depth_scale!r}")
-        self.normal_range = normal_range
-        self.depth_scale = depth_scale
+        _check_choice("normal_range", normal_range, ("unit", "published"))
+        _check_choice("depth_scale", depth_scale, ("frame", "crop"))
+        _check_choice("groups", groups, ("modulation", "published"))
+        self.normal_range, self.depth_scale, self.groups = normal_range, depth_scale, groups
         self.halo = 2 * blocks + 4
         self.diffuse, self.specular = (Generator(blocks, width, condition_width, condition) for _ in range(2))
         for network in (self.diffuse, self.specular):
@@ -232,7 +232,7 @@ class ACFM(Denoiser):
         logs = self.predict(buffers)
         exposure = self.exposure(buffers).to(logs.diffuse.dtype)
         with torch.autocast(logs.diffuse.device.type, enabled=False):
-            diffuse, specular = (_radiance_of(log) for log in logs)
+            diffuse, specular = (radiance_of(log) for log in logs)
             return Denoised((divisor(buffers["albedo"]) * diffuse + specular) / exposure)
 
     def predict(self, buffers: Buffers) -> Logs:
@@ -262,76 +262,45 @@ class ACFM(Denoiser):
         """
         made = self.predict(batch)
         with torch.no_grad():
-            diffuse = _wide(batch["reference_diffuse"])
-            target = self._logs(batch, diffuse, _wide(batch["reference"]) - diffuse)
+            diffuse = wide(batch["reference_diffuse"])
+            target = self._logs(batch, diffuse, wide(batch["reference"]) - diffuse)
         return {name: Pair(getattr(made, name), getattr(target, name)) for name in self.compared}
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of whole frames."""
-        return {"depth_range": _range(_finite(buffers["depth"].detach()))}
+        return {"depth_range": depth_range(buffers["depth"])}
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return `modulation` (modulations and condition networks) and `base` (all other parameters).
 
         The authors train the first at five times the rate and leave the second as it started for the first
-        20,000 steps.
+        20,000 steps. With `groups="published"` the residual blocks are in the first, too.
         """
+        fast = ("condition", "blocks", "body") if self.groups == "published" else ("condition",)
         groups: dict[str, list[nn.Parameter]] = {"modulation": [], "base": []}
         for name, parameter in self.named_parameters():
-            modulates = ".modulation." in name or name.split(".")[1] == "condition"
+            modulates = ".modulation." in name or name.split(".")[1] in fast
             groups["modulation" if modulates else "base"].append(parameter)
         return groups
 
     def _logs(self, buffers: Buffers, diffuse: Tensor, specular: Tensor) -> Logs:
         exposure = self.exposure(buffers)
         return Logs(
-            torch.log1p(_radiance(diffuse, exposure) / divisor(buffers["albedo"])),
-            torch.log1p(_radiance(specular, exposure)),
+            torch.log1p(exposed(diffuse, exposure) / divisor(buffers["albedo"])),
+            torch.log1p(exposed(specular, exposure)),
         )
 
     def _guides(self, buffers: Buffers) -> Tensor:
-        normal, depth, albedo = (_finite(_wide(buffers[name])) for name in ("normal", "depth", "albedo"))
         given = buffers.get("depth_range")
-        if given is None or (self.training and self.depth_scale == "crop"):
-            given = _range(depth)
-        far = given[:, 1, None, None, None].to(depth.dtype)
-        depth = torch.where(far > 0, depth.clamp_min(0.0) / torch.where(far > 0, far, 1.0), 0.0)
-        return torch.cat([(normal * 0.5 + 0.5).clamp(0.0, 1.0), depth, albedo], 1)
+        if self.training and self.depth_scale == "crop":
+            given = None
+        depth = relative_depth(buffers["depth"], given)
+        return torch.cat([unit_normal(buffers["normal"]), depth, finite(buffers["albedo"])], 1)
 
 
-def divisor(albedo: Tensor) -> Tensor:
-    """Return what diffuse radiance is divided by: albedo + 0.00316, positive and finite.
-
-    Source: the authors' code.
-    """
-    return torch.nan_to_num(_wide(albedo), 0.0, 1.0, 0.0).clamp_min(0.0) + ALBEDO_OFFSET
-
-
-def _radiance(radiance: Tensor, exposure: Tensor) -> Tensor:
-    """Return exposed radiance in [0, LARGEST]; what is no number counts as 0."""
-    return torch.nan_to_num(_wide(radiance) * _wide(exposure), 0.0).clamp(0.0, LARGEST)
-
-
-def _radiance_of(log: Tensor) -> Tensor:
-    """Return exp(log) - 1 without cancellation near 0, of operations that ONNX has."""
-    bounded = log.clamp_max(LARGEST_LOG)
-    return torch.tanh(bounded / 2) * (torch.exp(bounded) + 1)
-
-
-def _finite(tensor: Tensor) -> Tensor:
-    return torch.nan_to_num(tensor, 0.0, 0.0, 0.0)
-
-
-def _range(depth: Tensor) -> Tensor:
-    return torch.stack([depth.amin((1, 2, 3)), depth.amax((1, 2, 3))], 1)
-
-
-def _wide(tensor: Tensor) -> Tensor:
-    return tensor if tensor.dtype == torch.float64 else tensor.float()
-
-
-def _exporting() -> bool:
-    return torch.jit.is_tracing() or torch.compiler.is_exporting()
+def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
+    if value not in known:
+        raise ValueError(f"{name} must be {known[0]!r} or {known[1]!r}, got {value!r}")
 
 
 def _inner(maps: Tensor) -> Tensor:

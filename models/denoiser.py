@@ -141,12 +141,13 @@ class Denoiser(nn.Module):
         return batch, height, width
 
     def exposure(self, buffers: Buffers) -> Tensor:
-        """Return the exposure as (B, 1, 1, 1), 1 where the mapping has none."""
+        """Return the exposure as (B, 1, 1, 1), 1 where the mapping has none or one that is not positive."""
         like = buffers[self.inputs[0]]
         given = buffers.get("exposure")
         if given is None:
             return torch.ones((), dtype=like.dtype, device=like.device).reshape(1, 1, 1, 1)
-        return given.to(like.dtype).reshape(-1, 1, 1, 1)
+        given = given.to(like.dtype).reshape(-1, 1, 1, 1)
+        return torch.where(given > 0, given, 1.0)
 
 
 def select(denoiser: Denoiser, buffers: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -33,7 +33,9 @@ and they differ; here:
 Not taken over: Han's loader overwrites the specular reference with the noisy specular image.
 
 The paper trains each branch with L1 in its transformed space, then both with L1 on the image
-(`trainer.modules.Branches`); its tables are on a private data set.
+(`trainer.modules.Branches`); its tables are on a private data set. Published, 32 spp, Tungsten scenes, by
+AFGSA's authors, who trained it again (Yu et al. 2021, Table 1): 36.6687 dB PSNR, 2.840e-3 "RMSE" (half the
+relative squared error), 0.0509 1 - SSIM.
 """
 
 from __future__ import annotations
@@ -49,12 +51,9 @@ from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.boxes import exporting
 from models.ops.gather import Border, gather_padded, pad_border, strips
 from models.ops.gradients import backward_differences
-
-EPSILON = 0.00316
-"""Added to the albedo before dividing by it and before multiplying."""
-
-LARGEST = 1e10
-"""Bound of radiance and variances: far above any of a render, it keeps infinite pixels from making NaN."""
+from models.ops.guides import depth_range, divisor, farthest, finite, relative_depth
+from models.ops.precision import wide
+from models.ops.tonemap import LARGEST, exposed, radiance_of
 
 SIZE = 5
 """Rows and columns of a convolution."""
@@ -200,7 +199,7 @@ class KPCN(Denoiser):
             ValueError: A buffer is missing or has another shape.
         """
         clean = self._clean(buffers)
-        return Denoised(self._combine(self._filtered(clean), clean) / self.exposure(clean))
+        return Denoised(self._combine(self._filtered(clean), clean) / self.exposure(buffers))
 
     def training_pairs(self, batch: Mapping[str, Any]) -> dict[str, Pair]:
         """Return the filtered image of every branch in its transformed space, and the exposed color.
@@ -211,11 +210,11 @@ class KPCN(Denoiser):
         """
         clean = self._clean(select(self, batch))
         filtered = self._filtered(clean)
-        exposure, demodulator = self.exposure(clean), clean["albedo"] + EPSILON
-        reference = _radiance(batch["reference"].float()) * exposure
+        exposure, demodulator = self.exposure(batch), divisor(clean["albedo"])
+        reference = exposed(batch["reference"], exposure)
         lights = {"color": reference}
         if "diffuse" in self.transforms:
-            lights = {"diffuse": _radiance(batch["reference_diffuse"].float()) * exposure}
+            lights = {"diffuse": exposed(batch["reference_diffuse"], exposure)}
             lights["specular"] = (reference - lights["diffuse"]).clamp_min(0.0)
         pairs = {}
         for name, (light, transform) in zip(self.compared, self.transforms.items(), strict=False):
@@ -230,8 +229,7 @@ class KPCN(Denoiser):
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of whole frames."""
-        depth = _finite(buffers["depth"].detach(), 0.0)
-        return {"depth_range": torch.stack([depth.amin((1, 2, 3)), depth.amax((1, 2, 3))], 1)}
+        return {"depth_range": depth_range(buffers["depth"])}
 
     def network_input(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return the features (B, 27 or 28, H, W) of every branch, from the same buffers as `forward`."""
@@ -244,28 +242,19 @@ class KPCN(Denoiser):
     def _clean(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return finite buffers of legal range, radiance exposed, depth divided by the frame's largest."""
         self.check(buffers)
-        wide = {
-            name: value if value.dtype == torch.float64 else value.float()
-            for name, value in select(self, buffers).items()
-        }
-        exposure = self.exposure(wide)
-        clean = {"exposure": exposure}
+        exposure = wide(self.exposure(buffers))
+        clean = {}
         for light in self.transforms:
-            clean[light] = (_radiance(wide[light]) * exposure).clamp_max(LARGEST)
-            variance = _radiance(wide[f"{light}_variance"]) * exposure.square()
-            clean[f"{light}_variance"] = variance.clamp_max(LARGEST)
-        clean["albedo"] = _finite(wide["albedo"], 1.0).clamp_min(0.0)
-        clean["normal"] = _finite(wide["normal"], 0.0)
-        depth = _finite(wide["depth"], 0.0)
-        given = wide.get("depth_range")
-        bounds = self.measure(wide)["depth_range"] if given is None else given
-        largest = bounds[:, 1, None, None, None]
-        inverse = torch.where(largest > 0, 1 / torch.where(largest > 0, largest, 1.0), 0.0)
-        clean["depth"] = depth * inverse
+            clean[light] = exposed(buffers[light], exposure)
+            clean[f"{light}_variance"] = exposed(buffers[f"{light}_variance"], exposure.square())
+        clean["albedo"] = finite(buffers["albedo"], 1.0).clamp_min(0.0)
+        clean["normal"] = finite(buffers["normal"])
+        given = buffers.get("depth_range")
+        clean["depth"] = relative_depth(buffers["depth"], given)
         for name in ("albedo", "normal", "depth"):
             if f"{name}_variance" in self.inputs:
-                clean[f"{name}_variance"] = _radiance(wide[f"{name}_variance"])
-        clean["depth_variance"] = clean["depth_variance"] * inverse.square()
+                clean[f"{name}_variance"] = exposed(buffers[f"{name}_variance"], torch.ones_like(exposure))
+        clean["depth_variance"] = clean["depth_variance"] / farthest(buffers["depth"], given).square()
         return clean
 
     def _filtered(self, clean: Buffers) -> dict[str, Tensor]:
@@ -281,7 +270,7 @@ class KPCN(Denoiser):
         """Return exposed radiance."""
         color: Tensor | None = None
         for image, transform in zip(filtered.values(), self.transforms.values(), strict=True):
-            light = _exp_minus_one(image) if transform == "log" else image * (clean["albedo"] + EPSILON)
+            light = radiance_of(image) if transform == "log" else image * divisor(clean["albedo"])
             color = light if color is None else color + light
         assert color is not None
         return color
@@ -290,7 +279,7 @@ class KPCN(Denoiser):
         image = _transformed(clean, light, transform)
         variance = clean[f"{light}_variance"]
         if transform == "demodulated":
-            slope, least = clean["albedo"] + EPSILON, 0.0
+            slope, least = divisor(clean["albedo"]), 0.0
         else:
             # d log(1 + s) / ds = 1 / (1 + s); the addend is SBMC's.
             slope, least = 1 + (image if self.sbmc_compat else clean[light]), 1e-5
@@ -308,23 +297,7 @@ class KPCN(Denoiser):
 
 
 def _transformed(clean: Buffers, light: str, transform: Transform) -> Tensor:
-    return torch.log1p(clean[light]) if transform == "log" else clean[light] / (clean["albedo"] + EPSILON)
-
-
-def _exp_minus_one(image: Tensor) -> Tensor:
-    """Return exp(x) - 1, precise near 0; ONNX has no operator for it."""
-    if torch.onnx.is_in_onnx_export():
-        return (torch.exp(image) + 1) * torch.tanh(image / 2)
-    return torch.expm1(image)
-
-
-def _finite(image: Tensor, otherwise: float) -> Tensor:
-    return torch.where(torch.isnan(image) | torch.isinf(image), otherwise, image)
-
-
-def _radiance(image: Tensor) -> Tensor:
-    """Return radiance or variance, finite and not negative; infinite becomes `LARGEST`."""
-    return torch.where(torch.isnan(image), 0.0, image).clamp(0.0, LARGEST)
+    return torch.log1p(clean[light]) if transform == "log" else clean[light] / divisor(clean["albedo"])
 
 
 def _check_choice(name: str, value: str, known: tuple[str, ...]) -> None:

@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from models.ops.boxes import exporting
+from models.ops.precision import wide
 from models.ops.windows import Chunk, Windows, WindowSum, chunks, local_offsets
 
 
@@ -53,7 +54,7 @@ def block_attention(
     """
     if not exporting():
         _check(q, k, v, tables, windows)
-    q, k, v = _wide(q), _wide(k), _wide(v)
+    q, k, v = wide(q), wide(k), wide(v)
     position = position_table(*tables).to(q.dtype)
     with torch.autocast(q.device.type, enabled=False):
         if exporting():
@@ -86,10 +87,6 @@ def _check(q: Tensor, k: Tensor, v: Tensor, tables: tuple[Tensor, Tensor], windo
             raise ValueError(f"the {name} table has shape {tuple(table.shape)}, expected {expected}")
 
 
-def _wide(tensor: Tensor) -> Tensor:
-    return tensor if tensor.dtype == torch.float64 else tensor.float()
-
-
 def attention_weights(
     q: Tensor, k: Tensor, tables: tuple[Tensor, Tensor], windows: Windows, pixel: tuple[int, int]
 ) -> Tensor:
@@ -114,9 +111,9 @@ def attention_weights(
     size = (-(-height // block) * block, -(-width // block) * block)
     padding = [halo, size[1] - width + halo, halo, size[0] - height + halo]
     rows, columns = slice(top, top + side), slice(left, left + side)
-    keys = F.pad(_wide(k), padding)[..., rows, columns].reshape(batch, heads, -1, side * side)
+    keys = F.pad(wide(k), padding)[..., rows, columns].reshape(batch, heads, -1, side * side)
     keys = keys + position_table(*tables).to(keys.dtype).t()
-    query = _wide(q)[..., row, column].reshape(batch, heads, 1, -1)
+    query = wide(q)[..., row, column].reshape(batch, heads, 1, -1)
     scores = (query @ keys) * query.shape[-1] ** -0.5
     inside = F.pad(scores.new_ones(height, width), padding)[rows, columns].flatten() > 0
     if windows.mask_halo:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from models.ops.boxes import exporting
+from models.ops.precision import wide
 
 Border = Literal["reflect", "zero"]
 
@@ -65,7 +66,7 @@ def gather_padded(padded: Tensor, logits: Tensor, size: int) -> Tensor:
     Returns:
         (B, C, H, W).
     """
-    padded = padded if padded.dtype == torch.float64 else padded.float()
+    padded = wide(padded)
     if exporting():
         return _gather_exported(padded, logits.to(padded.dtype), size)
     if torch.is_grad_enabled() and (padded.requires_grad or logits.requires_grad):

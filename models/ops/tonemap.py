@@ -1,12 +1,21 @@
-"""Tone curves that networks see; they are part of a module, never of the data."""
+"""Exposure and tone curves that networks see; they are part of a module, never of the data."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
+from models.ops.boxes import exporting
+from models.ops.precision import wide
+
 GAMMA = 0.454545
 """Exponent of the WSKP code, which is not exactly 1 / 2.2."""
+
+LARGEST = 1e12
+"""Bound of exposed radiance, before log and after exp: far above any firefly, and products of it, such as
+squares, stay far below overflow."""
 
 _DARKEST = 1e-12
 """Below this the curve continues linearly: the slope of x**0.45 grows without bound at 0."""
@@ -23,8 +32,32 @@ def gamma(radiance: Tensor) -> Tensor:
 
     Source: the tone curve of Fan et al. 2021 (doi:10.1111/cgf.14338), as in the authors' code.
     """
-    wide = radiance if radiance.dtype == torch.float64 else radiance.float()
-    bounded = wide.clamp(0.0, 1.0)
+    bounded = wide(radiance).clamp(0.0, 1.0)
     dark = bounded < _DARKEST
     curve = bounded.clamp_min(_DARKEST).pow(GAMMA)
     return torch.where(dark, bounded * (_DARKEST ** (GAMMA - 1.0)), curve)
+
+
+def exposed(radiance: Tensor, exposure: Tensor) -> Tensor:
+    """Return radiance times exposure in [0, LARGEST], float32 or wider; what is no number counts as 0.
+
+    Args:
+        radiance: Linear radiance (B, C, H, W); or its variance, with the square of the exposure.
+        exposure: (B, 1, 1, 1) or (1, 1, 1, 1).
+    """
+    return torch.nan_to_num(wide(radiance) * wide(exposure), 0.0).clamp(0.0, LARGEST)
+
+
+def radiance_of(log: Tensor) -> Tensor:
+    """Return exp(log) - 1, the inverse of log(1 + radiance), in [0, LARGEST] and precise near 0.
+
+    ONNX has no operator for exp(x) - 1. Recorded graphs hold (exp(x) + 1) tanh(x / 2), which is the same and
+    as precise.
+
+    Args:
+        log: float32 or wider; negative values count as 0.
+    """
+    bounded = log.clamp(0.0, math.log1p(LARGEST))
+    if not exporting():
+        return torch.expm1(bounded)
+    return (torch.exp(bounded) + 1.0) * torch.tanh(0.5 * bounded)

@@ -44,6 +44,14 @@ def test_parameter_counts_are_the_published_ones() -> None:
     assert sum(groups.values()) == 3_060_038
 
 
+def test_the_published_fast_group_lacks_only_head_and_tail() -> None:
+    network = ACFM(groups="published")
+    slow = {id(p) for p in network.parameter_groups()["base"]}
+    names = {name.split(".", 1)[1] for name, p in network.named_parameters() if id(p) in slow}
+    layers = ("head", "tail", "last")
+    assert names == {f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias")}
+
+
 def test_layers_are_the_published_ones() -> None:
     shapes = {name: tuple(p.shape) for name, p in ACFM().diffuse.named_parameters() if name[-6:] == "weight"}
     expected: dict[str, tuple[int, ...]] = {"condition.0.weight": (128, 7, 3, 3)}
@@ -246,7 +254,8 @@ def test_artifacts_agree_at_other_sizes(tmp_path: Path, format: str) -> None:
         ({"blocks": -1}, "blocks is too small"),
         ({"width": 0}, "width is too small"),
         ({"normal_range": "raw"}, "normal_range"),
-        ({"depth_scale": "tile"}, "depth_scale"),
+        ({"depth_scale": "tile"}, "depth_scale must be 'frame' or 'crop', got 'tile'"),
+        ({"groups": "all"}, "groups must be 'modulation' or 'published'"),
     ],
 )
 def test_impossible_options_are_refused(options: dict[str, Any], message: str) -> None:

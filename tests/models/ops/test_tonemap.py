@@ -1,10 +1,11 @@
-"""The display curve that WSKP's network sees."""
+"""The tone curves that networks see, and their way back."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from models.ops.tonemap import gamma
+from models.ops.tonemap import LARGEST, exposed, gamma, radiance_of
 
 
 def test_gamma_is_the_clamped_power_of_the_authors() -> None:
@@ -24,3 +25,34 @@ def test_gamma_has_finite_gradients_at_black_and_white() -> None:
 
 def test_gamma_computes_in_float32_for_half_precision_input() -> None:
     assert gamma(torch.tensor([0.5], dtype=torch.bfloat16)).dtype == torch.float32
+
+
+def test_exposed_radiance_is_finite_and_not_negative() -> None:
+    radiance = torch.tensor([2.0, -3.0, float("nan"), float("inf"), -float("inf"), 65504.0, 1e30])
+    found = exposed(radiance, torch.tensor(4.0))
+    expected = torch.tensor([8.0, 0.0, 0.0, LARGEST, 0.0, 4 * 65504.0, LARGEST])
+    assert torch.equal(found, expected)
+
+
+def test_exposure_is_applied_before_half_precision_overflows() -> None:
+    found = exposed(torch.tensor([60000.0]).half(), torch.tensor([4.0]).half())
+    assert found.dtype == torch.float32
+    assert found.item() == 4 * torch.tensor(60000.0).half().item()
+
+
+LOGS = torch.tensor([-2.0, 0.0, 1e-7, 1e-3, 0.5, 1.0, 3.0, 11.1, 27.0, 28.0, 500.0])
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_radiance_of_a_logarithm_is_its_inverse_also_in_recorded_graphs(
+    recorded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("models.ops.tonemap.exporting", lambda: recorded)
+    logs = LOGS.clone().requires_grad_()
+    found = radiance_of(logs)
+    expected = torch.expm1(LOGS.double().clamp_min(0)).clamp_max(LARGEST).float()
+    torch.testing.assert_close(found, expected, rtol=2e-6, atol=0)
+    found.sum().backward()
+    assert logs.grad is not None
+    torch.testing.assert_close(logs.grad[1:9], LOGS[1:9].exp(), rtol=2e-6, atol=0)
+    assert logs.grad[0] == logs.grad[-1] == 0
