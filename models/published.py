@@ -18,6 +18,9 @@ from models.blocks.rep import RepBlock
 from models.denoiser import Denoiser
 from models.wskp import WSKP
 
+_WRAPPERS = ("model_state_dict", "state_dict", "model", "G")
+"""Under which checkpoints keep the weights, beside the optimiser and the like."""
+
 _BRANCHES = (5, 3, 1)
 _PUBLISHED_KERNELS = (3, 5, 7, 9, 11, 13)
 
@@ -32,8 +35,8 @@ def load_published(name: str, state_dict: Mapping[str, Any]) -> Denoiser:
     Args:
         name: `wskp`: Fan et al. 2021, checkpoints of the authors' repository. `afgsa`: Yu et al. 2021, the
             generator. Both are under the MIT licence.
-        state_dict: The checkpoint (a dict with `model_state_dict` or `state_dict`), or its inner dict of
-            tensors. Names may begin with `module.`, as parallel training writes them.
+        state_dict: The checkpoint (a dict with `model_state_dict`, `state_dict`, `model` or `G`), or the inner
+            dict of tensors. Names may begin with `module.`, as parallel training writes them.
 
     Returns:
         The network in evaluation mode, in its training form; its output is the authors' network's.
@@ -44,9 +47,11 @@ def load_published(name: str, state_dict: Mapping[str, Any]) -> Denoiser:
     if name not in _LOADERS:
         raise ValueError(f"no published weights are known for {name!r}; known: {', '.join(_LOADERS)}")
     inner: Any = state_dict
-    for wrapper in ("model_state_dict", "state_dict"):
+    for wrapper in _WRAPPERS:
         inner = inner.get(wrapper, inner) if isinstance(inner, Mapping) else inner
-    if not isinstance(inner, Mapping) or not all(isinstance(v, Tensor) for v in inner.values()):
+    if not isinstance(inner, Mapping) or not all(
+        isinstance(key, str) and isinstance(value, Tensor) for key, value in inner.items()
+    ):
         raise ValueError(f"{name}: expected names and tensors, or a checkpoint with 'model_state_dict'")
     weights = {key.removeprefix("module."): value for key, value in inner.items()}
     return _LOADERS[name](weights)
@@ -80,7 +85,7 @@ def _load_afgsa(weights: Mapping[str, Tensor]) -> AFGSA:
     table each, are too; blocks and halo are those of the paper with tables of this length.
     """
     table = weights.get("transformer_blocks.0.attention.rel_h")
-    if table is None or table.ndim != 4 or "conv_map.0.weight" not in weights:
+    if table is None or table.ndim != 4 or "conv_map.0.bias" not in weights:
         listed = ", ".join(list(weights)[:5]) or "nothing"
         raise ValueError(f"afgsa: not the entries of the authors' generator (conv1.0.weight …); got {listed}")
     if table.shape[1] not in _AFGSA_WINDOWS:
@@ -89,11 +94,11 @@ def _load_afgsa(weights: Mapping[str, Tensor]) -> AFGSA:
             f"{' or '.join(map(str, _AFGSA_WINDOWS))}"
         )
     block, halo = _AFGSA_WINDOWS[table.shape[1]]
-    width = weights["conv_map.0.weight"].shape[0]
+    width, half = weights["conv_map.0.bias"].numel(), max(table.shape[3], 1)
     sizes = sorted(int(m[1]) for m in (re.fullmatch(r"conv(\d+)\.0\.weight", key) for key in weights) if m)
     blocks = len({key.split(".")[1] for key in weights if key.startswith("transformer_blocks.")})
     network = AFGSA(
-        width=width, blocks=blocks, heads=width // (2 * table.shape[3]), kernel_sizes=sizes,
+        width=width, blocks=blocks, heads=width // (2 * half), kernel_sizes=sizes,
         block=block, halo=halo,
     )  # fmt: skip
     targets = network.state_dict()
@@ -102,9 +107,9 @@ def _load_afgsa(weights: Mapping[str, Tensor]) -> AFGSA:
     _compare("afgsa: unexpected", set(weights) - set(names))
     for name, key in names.items():
         source = weights[name]
-        if name.endswith(("rel_h", "rel_w")):
+        if name.endswith(("rel_h", "rel_w")) and source.ndim == 4:
             # (1, side, 1, channels) and (1, 1, side, channels) there.
-            source = source.reshape(-1, source.shape[-1])
+            source = source.squeeze(0).squeeze(1 if name.endswith("h") else 0)
         _copy(f"afgsa: {name}", source, targets[key])
     return network.eval()
 

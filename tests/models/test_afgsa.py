@@ -26,6 +26,15 @@ VARIANTS: list[dict[str, Any]] = [
     {"attention": "local", "window": 9, "mask_halo": True},
 ]
 
+TINY: dict[str, Any] = {"width": 8, "blocks": 1, "heads": 1}
+ABLATIONS: list[dict[str, Any]] = [
+    *({**TINY, "kernel_sizes": sizes} for sizes in ((1, 3, 5, 7), (3,), (5,), (7,))),
+    {**TINY, "block": 16, "halo": 5},
+    {"width": 8, "blocks": 4, "heads": 1, "attention": "local", "window": 3},
+    {**TINY, "auxiliary": ("normal", "depth")},
+]
+"""Rows of the paper's tables 2 to 4 and figure 9 that `VARIANTS` lack."""
+
 
 def small(**arguments: Any) -> AFGSA:
     torch.manual_seed(5)
@@ -173,7 +182,7 @@ def test_every_variant_runs_at_any_size_and_trains(arguments: dict[str, Any]) ->
         assert parameter.grad.abs().max() > 0, name
 
 
-@pytest.mark.parametrize("arguments", VARIANTS, ids=str)
+@pytest.mark.parametrize("arguments", [*VARIANTS, *ABLATIONS], ids=str)
 def test_the_halo_of_every_variant_is_its_reach(arguments: dict[str, Any]) -> None:
     network = small(**arguments).double()
     side, halo = network.multiple, network.halo

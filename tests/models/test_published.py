@@ -202,7 +202,7 @@ def test_afgsas_entries_are_those_of_the_authors_code() -> None:
     assert shapes == afgsa_entries()
 
 
-@pytest.mark.parametrize("wrapper", [None, "model_state_dict", "state_dict"])
+@pytest.mark.parametrize("wrapper", [None, "model_state_dict", "state_dict", "model", "G"])
 def test_afgsa_with_the_authors_weights_gives_their_output(wrapper: str | None) -> None:
     torch.manual_seed(4)
     plain = PlainAFGSA(16, 3, 2)
@@ -241,6 +241,27 @@ def test_an_entry_of_afgsa_of_another_shape_is_named() -> None:
     wrong = {**authors_afgsa(), "decoder.0.0.bias": torch.zeros(17)}
     with pytest.raises(ValueError, match=r"decoder\.0\.0\.bias has shape \(17,\), expected \(16,\)"):
         load_published("afgsa", wrong)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1, 14, 1, 0), (1, 3, 7, 4)], ids=str)
+def test_any_entry_of_afgsa_of_a_wrong_shape_is_an_error_that_says_so(shape: tuple[int, ...]) -> None:
+    weights = authors_afgsa(8, 1)
+    for name in weights:
+        with pytest.raises(ValueError, match=r"afgsa|AFGSA"):
+            load_published("afgsa", {**weights, name: torch.zeros(shape)})
+
+
+def test_tables_of_rows_and_columns_are_not_mistaken_for_each_other() -> None:
+    weights = authors_afgsa()
+    names = [f"transformer_blocks.0.attention.rel_{axis}" for axis in "hw"]
+    swapped = {**weights, names[0]: weights[names[1]], names[1]: weights[names[0]]}
+    with pytest.raises(ValueError, match="afgsa: "):
+        load_published("afgsa", swapped)
+
+
+def test_names_that_are_no_words_are_refused() -> None:
+    with pytest.raises(ValueError, match="afgsa: expected names and tensors"):
+        load_published("afgsa", {1: torch.zeros(1)})  # type: ignore[dict-item]
 
 
 def test_weights_of_another_network_are_refused_as_afgsas() -> None:
