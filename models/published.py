@@ -35,8 +35,8 @@ def load_published(name: str, state_dict: Mapping[str, Any]) -> Denoiser:
     Args:
         name: `wskp`: Fan et al. 2021, checkpoints of the authors' repository. `afgsa`: Yu et al. 2021, the
             generator. Both are under the MIT licence.
-        state_dict: The checkpoint (a dict with `model_state_dict`, `state_dict`, `model` or `G`), or the inner
-            dict of tensors. Names may begin with `module.`, as parallel training writes them.
+        state_dict: The checkpoint (a dict with `model_state_dict`, `state_dict`, `model` or `G`), or its
+            inner dict of tensors. Names may begin with `module.`, as parallel training writes them.
 
     Returns:
         The network in evaluation mode, in its training form; its output is the authors' network's.
