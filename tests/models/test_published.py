@@ -261,7 +261,7 @@ def test_tables_of_rows_and_columns_are_not_mistaken_for_each_other() -> None:
 
 def test_names_that_are_no_words_are_refused() -> None:
     with pytest.raises(ValueError, match="afgsa: expected names and tensors"):
-        load_published("afgsa", {1: torch.zeros(1)})  # type: ignore[dict-item]
+        load_published("afgsa", {1: torch.zeros(1)})  # type: ignore[call-overload]
 
 
 def test_weights_of_another_network_are_refused_as_afgsas() -> None:
