@@ -10,7 +10,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from models import WSKP
 from tests.synthetic import Synthetic, patch
-from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint, recorder
+from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint, ValidationPictures, recorder
 from trainer.callbacks.progress import TrainingProgress, duration
 from trainer.callbacks.recorder import RunRecorder, flatten, git_state, installed
 from trainer.modules import Regression
@@ -124,13 +124,43 @@ def test_last_checkpoint_holds_the_end_of_training_whatever_the_interval(tmp_pat
 
 def test_plain_lines_tell_rate_waiting_loss_and_time_left(tmp_path, capsys):
     progress = TrainingProgress(plain_interval_s=0.0)
-    trainer = small_trainer(tmp_path, progress, log_every_n_steps=1)
+    trainer = small_trainer(tmp_path, progress, log_every_n_steps=2)
     trainer.fit(Regression(WSKP(layers=3)), datamodule=Synthetic())
     lines = capsys.readouterr().err.splitlines()
+    first = next(line for line in lines if "step 1/4" in line)
+    assert "left" in first
+    assert "patches/s" not in first, "it is not measured yet"
     step = next(line for line in lines if "step 4/4" in line)
     assert all(word in step for word in ("patches/s", "waiting", "loss", "left"))
     assert any("validation PSNR" in line for line in lines)
     assert 0 <= float(trainer.logged_metrics["throughput/waiting"]) <= 1
+
+
+@pytest.mark.parametrize(
+    ("options", "validated", "pictured"),
+    [
+        ({"max_epochs": 12}, range(12), [0, 5, 10, 11]),
+        ({"max_epochs": 12, "check_val_every_n_epoch": 2}, range(1, 12, 2), [1, 7, 11]),
+        ({"max_epochs": 13, "check_val_every_n_epoch": 4}, range(3, 13, 4), [3, 11]),
+        ({"max_epochs": -1, "max_steps": 8}, range(8), [0, 5, 7]),
+    ],
+)
+def test_first_and_last_validated_epochs_are_pictured_and_some_between(options, validated, pictured):
+    defaults = {"max_steps": -1, "check_val_every_n_epoch": 1, "sanity_checking": False}
+    state = SimpleNamespace(fn="fit")
+    whole, kept, first = [], [], ValidationPictures(every_n_epochs=5)
+    for epoch in validated:
+        trainer = SimpleNamespace(
+            current_epoch=epoch, global_step=epoch + 1, state=state, **defaults | options
+        )
+        first.on_validation_epoch_start(trainer, None)
+        whole += [epoch] * first.due
+        continued = ValidationPictures(every_n_epochs=5)  # as if killed and resumed after every epoch
+        continued.load_state_dict(kept[-1] if kept else {})
+        continued.on_validation_epoch_start(trainer, None)
+        assert continued.due == first.due
+        kept.append(continued.state_dict())
+    assert whole == pictured
 
 
 def test_durations_read_as_people_say_them():

@@ -19,7 +19,8 @@ class ValidationPictures(Callback):
     Every crop is one strip at equal exposure, with the metrics below it and a false-colour error map.
 
     Args:
-        every_n_epochs: Distance between two epochs that are pictured; the first and the last always are.
+        every_n_epochs: Least distance between two epochs that are pictured; of the epochs that are validated
+            the first and the last always are.
         crops_per_scene: Number of crops of each scene.
     """
 
@@ -27,10 +28,23 @@ class ValidationPictures(Callback):
         self.every_n_epochs = every_n_epochs
         self.crops_per_scene = crops_per_scene
         self._seen: dict[str, int] = {}
+        self._pictured: int | None = None  # the last epoch that was
+        self.due = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the epoch that was pictured last."""
+        return {"pictured": self._pictured}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Keep the distance from the pictures of the run that is continued."""
+        self._pictured = state_dict.get("pictured")
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start with no crop pictured."""
         self._seen = {}
+        self.due = self._is_due(trainer)
+        if self.due:
+            self._pictured = trainer.current_epoch
 
     def on_validation_batch_end(
         self,
@@ -43,7 +57,7 @@ class ValidationPictures(Callback):
     ) -> None:
         """Picture the crops of this batch that are still wanted."""
         logger = trainer.logger
-        if not trainer.is_global_zero or not isinstance(logger, MLflowTracking) or not self._due(trainer):
+        if not trainer.is_global_zero or not isinstance(logger, MLflowTracking) or not self.due:
             return
         wanted = [
             row for row, scene in enumerate(batch["scene"]) if self._seen.get(scene, 0) < self.crops_per_scene
@@ -60,11 +74,13 @@ class ValidationPictures(Callback):
             folder.mkdir(exist_ok=True)
             picture.save(folder / f"step{trainer.global_step:06}-{scene}-{number}.png")
 
-    def _due(self, trainer: Trainer) -> bool:
+    def _is_due(self, trainer: Trainer) -> bool:
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return False
-        epoch, last = trainer.current_epoch, (trainer.max_epochs or 0) - 1
-        return epoch % self.every_n_epochs == 0 or epoch == last
+        epoch, last = trainer.current_epoch, self._pictured
+        if last is None or last == epoch:  # an epoch may be validated more than once
+            return True
+        return epoch - last >= self.every_n_epochs or _final(trainer)
 
     @torch.no_grad()
     def _strip(self, module: LightningModule, batch: dict[str, Any], row: int) -> Any:
@@ -82,3 +98,12 @@ class ValidationPictures(Callback):
         }
         place = f"{batch['scene'][row]}, frame {int(batch['frame'][row])}"
         return comparison(**arrays, exposure=float(one["exposure"][0]), title=place)  # type: ignore[arg-type]
+
+
+def _final(trainer: Trainer) -> bool:
+    """Return whether no later epoch is validated."""
+    if trainer.max_steps != -1 and trainer.global_step >= trainer.max_steps:
+        return True
+    last = -1 if trainer.max_epochs is None else trainer.max_epochs - 1
+    following = trainer.current_epoch + (trainer.check_val_every_n_epoch or 1)
+    return last >= 0 and following > last

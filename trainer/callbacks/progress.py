@@ -147,15 +147,17 @@ class TrainingProgress(ProgressBar):
         self._waiting = min(max((waiting - waiting_then) / elapsed, 0.0), 1.0)
         self._mark = (now, self._patches, waiting)
 
-    def _numbers(self, trainer: Trainer) -> str:
-        parts = [f"{self._rate:.1f} patches/s", f"waiting {self._waiting:.1%}"]
+    def _numbers(self, trainer: Trainer) -> list[str]:
+        parts = []
+        if self._rate:  # nothing is measured before the first report
+            parts = [f"{self._rate:.1f} patches/s", f"waiting {self._waiting:.1%}"]
         if self._loss is not None:
             parts.append(f"loss {self._loss:.4f}")
         if self._gap is not None:
             parts.append(f"gap {self._gap:.3g}")
         if "val/psnr_wskp" in trainer.callback_metrics:
             parts.append(f"val {float(trainer.callback_metrics['val/psnr_wskp']):.2f} dB")
-        return " | ".join(parts)
+        return parts
 
     def _scores(self, trainer: Trainer) -> str:
         names = {"val/psnr_wskp": "PSNR {:.2f} dB", "val/ssim_wskp": "SSIM {:.4f}", "val/loss": "loss {:.4f}"}
@@ -170,14 +172,19 @@ class TrainingProgress(ProgressBar):
         left = (now - self._started) / done * max(total - step, 0)
         if self._bar is not None:
             self._bar.update(
-                self._task, completed=step, left=left, numbers=self._numbers(trainer),
+                self._task, completed=step, left=left, numbers=" | ".join(self._numbers(trainer)),
                 description=f"epoch {trainer.current_epoch}",
             )  # fmt: skip
         elif now - self._printed > self.plain_interval_s:
             self._printed = now
             self._line(
-                f"epoch {trainer.current_epoch} step {step}/{total:.0f} | {self._numbers(trainer)} | "
-                f"{duration(left)} left"
+                " | ".join(
+                    [
+                        f"epoch {trainer.current_epoch} step {step}/{total:.0f}",
+                        *self._numbers(trainer),
+                        f"{duration(left)} left",
+                    ]
+                )
             )
 
     def _line(self, text: str) -> None:
