@@ -63,7 +63,7 @@ def attentive(model: Model, name: str) -> Attentive:
             "made from"
         )
     if not isinstance(model, Attentive):
-        raise ValueError(f"{needed}; {name} is a {type(model).__name__}, which has none")
+        raise ValueError(f"{needed}; {name} holds {type(model).__name__}, which has none")
     return model
 
 

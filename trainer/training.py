@@ -45,6 +45,10 @@ def quiet_libraries() -> None:
         (r".*does not have many workers.*", UserWarning),  # the loader's own choice
         (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
         (r".*is smaller than the logging interval.*", UserWarning),
+        (
+            r"It is recommended to use .*sync_dist=True",
+            UserWarning,
+        ),  # scores are reduced before they are logged
         (r".*callbacks used to create the checkpoint need to be provided.*", UserWarning),  # test, validate
     ):
         warnings.filterwarnings("ignore", message, category)
@@ -111,7 +115,18 @@ def explain(message: str, known: Iterable[str]) -> str:
         leaf = difflib.get_close_matches(word.rsplit(".", 1)[-1], known, n=1, cutoff=0.6)
         near = [f"{word.rpartition('.')[0]}.{leaf[0]}".lstrip(".")] if leaf else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"unknown option {word!r}{hint} ({text[:300]})" if hint else text
+    if not hint:
+        return text
+    # Where classes are nested jsonargparse tells of every class that was tried.
+    return f"unknown option {word!r}{hint}" + ("" if "Does not validate" in text else f" ({text[:300]})")
+
+
+def refused(message: str) -> str:
+    """Return why a class refused its arguments, from jsonargparse's account of everything it tried."""
+    if not message.startswith("Does not validate"):
+        return message
+    reasons = re.findall(r"^ *- (?!Expected a)(.+)$", message.partition("Given value type")[0], re.MULTILINE)
+    return "; ".join(dict.fromkeys(reasons)) or message
 
 
 def net_inputs(net: Denoiser) -> tuple[str, ...]:
@@ -167,22 +182,23 @@ class TrainingCLI(LightningCLI):
         """Parse, then find the checkpoint that is meant and the run that it belongs to."""
         super().parse_arguments(parser, args)
         config = self.config[self.config.subcommand]
-        if self.config.subcommand != "fit":
+        evaluation = self.config.subcommand != "fit"
+        if evaluation:
             config.verbose = False
-            config.ckpt_path = config.ckpt_path or "best"
         logger = config.trainer.logger
         tracked = getattr(logger, "class_path", None) == TRACKING
-        if config.ckpt_path:
+        if config.ckpt_path or evaluation:
             root = Path(logger.init_args.root if tracked else "runs")
             experiment = logger.init_args.experiment if tracked else "penumbra"
-            config.ckpt_path = str(runs.find_checkpoint(config.ckpt_path, root, experiment))
+            find = evaluated if evaluation else runs.find_checkpoint
+            config.ckpt_path = str(find(config.ckpt_path or "", root, experiment))
             folder = runs.folder_of_checkpoint(Path(config.ckpt_path))
             if tracked and folder is not None:
                 logger.init_args.resume_from = str(folder)
-                logger.init_args.evaluation = self.config.subcommand != "fit"
-            elif self.config.subcommand != "fit":
+                logger.init_args.evaluation = evaluation
+            elif evaluation:
                 config.trainer.logger = False
-        if self.config.subcommand != "fit":
+        if evaluation:
             keep = ("TrainingProgress",)
             config.trainer.callbacks = [
                 c for c in config.trainer.callbacks or [] if c.class_path.endswith(keep)
@@ -190,7 +206,10 @@ class TrainingCLI(LightningCLI):
 
     def instantiate_classes(self) -> None:
         """Build everything, and say early which options of the trainer have no effect."""
-        super().instantiate_classes()
+        try:
+            super().instantiate_classes()
+        except ValueError as error:
+            raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
 
     def _parse_ckpt_path(self) -> None:
@@ -208,6 +227,36 @@ class TrainingCLI(LightningCLI):
                 Path(config.ckpt_path), arguments.net,
                 critics=expected_critics(arguments) if self.config.subcommand == "fit" else None,
             )  # fmt: skip
+
+
+def evaluated(word: str, root: Path, experiment: str) -> Path:
+    """Return the checkpoint that `validate` and `test` score.
+
+    Of a run, the newest one where nothing is named, that is the best by validation, or the last where no
+    validation has chosen one.
+
+    Args:
+        word: As for `fit`, or empty.
+        root: Folder of all runs.
+        experiment: Whose runs.
+
+    Raises:
+        ValueError: There is none; the message says where it was looked for.
+    """
+    named = Path(word) if word else None
+    if named is not None and not named.is_dir():
+        return runs.find_checkpoint(word, root, experiment)
+    folders = [named] if named is not None else runs.run_folders(root, experiment)[::-1]
+    for folder in folders:
+        for name in ("best", "last"):
+            path = folder / "checkpoints" / f"{name}.ckpt"
+            if path.is_file():
+                if name == "last":
+                    print(f"note: no validation chose a best checkpoint, scoring {path}", file=sys.stderr)
+                return path
+    place = named or f"no run of {experiment!r} below {root / experiment}"
+    holds = "holds no checkpoint" if named else "has a checkpoint"
+    raise ValueError(f"{place} {holds}; train one first with `trainer fit`, or give --ckpt_path FILE")
 
 
 def check_manual(module: LightningModule, trainer: Trainer) -> None:

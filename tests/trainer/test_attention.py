@@ -193,7 +193,7 @@ def test_models_without_attention_say_what_is_needed(checkpoint: Path, tmp_path:
     folder = folder_of(tmp_path / "in", frame(0))
     options = (folder, "--output", tmp_path / "out", "--png", "--attention", "1,2")
     with pytest.raises(
-        ValueError, match=r"such as AFGSA; JointBilateral is a JointBilateral, which has none"
+        ValueError, match=r"such as AFGSA; JointBilateral holds JointBilateral, which has none"
     ):
         run("--model", "JointBilateral", *options)
     net = WSKP(layers=2, width=6, kernel_sizes=(3, 5))

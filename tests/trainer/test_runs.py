@@ -1,6 +1,7 @@
 import pytest
 
 from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint, new_folder
+from trainer.training import evaluated
 
 
 def make_run(root, name, *checkpoints):
@@ -30,6 +31,26 @@ def test_run_folder_stands_for_its_last_checkpoint(tmp_path):
     path = find_checkpoint(str(folder), tmp_path, "exp")
     assert path == folder / "checkpoints" / "last.ckpt"
     assert folder_of_checkpoint(path) == folder.resolve()
+
+
+def test_evaluation_takes_the_best_checkpoint_of_the_newest_run_or_its_last(tmp_path, capsys):
+    older = make_run(tmp_path, "20260101-000000", "last", "best") / "checkpoints"
+    assert evaluated("", tmp_path, "exp") == older / "best.ckpt"
+    assert evaluated("last", tmp_path, "exp") == older / "last.ckpt"
+    assert evaluated(str(older.parent), tmp_path, "exp") == older / "best.ckpt"
+    assert capsys.readouterr().err == ""
+    newer = make_run(tmp_path, "20260102-000000", "last")
+    make_run(tmp_path, "20260103-000000")  # has just begun
+    assert evaluated("", tmp_path, "exp") == newer / "checkpoints" / "last.ckpt"
+    assert f"scoring {newer / 'checkpoints' / 'last.ckpt'}" in capsys.readouterr().err
+
+
+def test_evaluation_without_a_checkpoint_says_what_to_do(tmp_path):
+    with pytest.raises(ValueError, match=r"no run of 'exp' below .* has a checkpoint; train one first"):
+        evaluated("", tmp_path, "exp")
+    empty = make_run(tmp_path, "20260101-000000")
+    with pytest.raises(ValueError, match=r"20260101-000000 holds no checkpoint; train one first"):
+        evaluated(str(empty), tmp_path, "exp")
 
 
 def test_checkpoint_outside_a_run_has_no_folder(tmp_path):
