@@ -1,15 +1,17 @@
 """Adversarial training as a run: resuming, averaged weights, logs, divergence, precision, refusals."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from tests.synthetic import Patches, Synthetic, patch
-from tests.trainer.stand_ins import BrokenCritic, LogNet, SplitNet, fit, module, trainer
+from tests.trainer.stand_ins import BrokenCritic, LogNet, SmoothCritic, SplitNet, fit, module, trainer
 from trainer.callbacks import FiniteGuard, LastCheckpoint, TrainingProgress
 from trainer.schedules import Halving
 
@@ -278,9 +280,37 @@ def test_wrong_arguments_are_refused(options, message):
         module(**options)
 
 
-def test_half_precision_with_a_scaler_is_refused_with_what_works():
-    with pytest.raises(ValueError, match=r"precision bf16-true.*--trainer.precision bf16-mixed or 32-true"):
-        fit(module(), precision="bf16-true")
+@pytest.mark.parametrize("precision", ["16-mixed", "16-true", "bf16-true"])
+def test_precision_that_the_penalty_exceeds_is_refused_with_what_works(precision):
+    # Without a GPU Lightning itself would turn 16-mixed into bf16-mixed.
+    trained = module()
+    trained.trainer = SimpleNamespace(strategy=SingleDeviceStrategy(), precision=precision)
+    with pytest.raises(
+        ValueError, match=rf"precision {precision}.*--trainer.precision bf16-mixed or 32-true"
+    ):
+        trained.setup("fit")
+    trained.setup("test")
+
+
+def test_strategy_that_divides_a_network_is_refused_with_what_works():
+    trained = module()
+    trained.trainer = SimpleNamespace(strategy=FSDPStrategy(), precision="32-true")
+    with pytest.raises(ValueError, match=r"on one device or with --trainer.strategy ddp"):
+        trained.setup("fit")
+
+
+@pytest.mark.parametrize(
+    "options", [{"adversarial_weight": 0.0}, {"critic": partial(SmoothCritic, width=5)}, {"net": SplitNet}]
+)
+def test_denoiser_of_a_run_is_evaluated_without_its_critics_or_with_others(tmp_path, options):
+    fit(module(), folder=tmp_path, callbacks=[saving(tmp_path)])
+    saved = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
+    other = module(**options)
+    critics = {name: value.clone() for name, value in other.critics.state_dict().items()}
+    made = trainer(tmp_path, [saving(tmp_path)], limit_val_batches=1)
+    made.validate(other, Synthetic(2, 4), tmp_path / "last.ckpt", verbose=False, weights_only=True)
+    assert all(torch.equal(saved[f"net.{name}"], value) for name, value in other.net.state_dict().items())
+    assert same(critics, dict(other.critics.state_dict()))
 
 
 def test_schedule_that_waits_for_a_score_is_refused():
