@@ -10,6 +10,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
+from models import AFGSA
 from tests.synthetic import Patches, Synthetic, patch
 from tests.trainer.stand_ins import BrokenCritic, LogNet, SmoothCritic, SplitNet, fit, module, trainer
 from trainer.callbacks import FiniteGuard, LastCheckpoint, TrainingProgress
@@ -234,10 +235,14 @@ class Fireflies(Synthetic):
         return DataLoader(made, self.batch_size)
 
 
-def test_fifty_steps_in_bfloat16_stay_near_those_in_float32(monkeypatch):
+@pytest.mark.parametrize(
+    ("net", "rate"),
+    [(partial(LogNet, width=8), 3e-3), (partial(AFGSA, width=16, blocks=1, checkpointed=1), 1e-3)],
+)
+def test_fifty_steps_in_bfloat16_stay_near_those_in_float32(net, rate):
     losses = {}
     for precision in ("32-true", "bf16-mixed"):
-        trained = module(partial(LogNet, width=8), optimizer=partial(torch.optim.Adam, lr=3e-3))
+        trained = module(net, optimizer=partial(torch.optim.Adam, lr=rate))
         numbers = []
         taken = trained.training_step
 
@@ -254,7 +259,7 @@ def test_fifty_steps_in_bfloat16_stay_near_those_in_float32(monkeypatch):
     exact, rounded = losses.values()
     assert torch.isfinite(rounded).all()
     assert not torch.equal(exact, rounded)
-    assert exact[-10:, 0].mean() < 0.8 * exact[:10, 0].mean()
+    assert exact[-10:, 0].mean() < 0.95 * exact[:10, 0].mean()
     assert torch.allclose(exact[:, 0], rounded[:, 0], rtol=0.02)
     assert torch.allclose(exact[:, 1], rounded[:, 1], rtol=0.05, atol=0.05)
 

@@ -220,7 +220,7 @@ class Adversarial(Evaluated):
             gap = critic(real).float().mean() - critic(fake).float().mean()
             penalty = gradient_penalty(critic, real, fake, mix)
             loss = (-0.5 if self.halved else -1.0) * gap + self.penalty_weight * penalty
-            self.manual_backward(loss)
+            self._backward(loss)
             for kind, value in (("loss", loss), ("gap", gap), ("penalty", penalty)):
                 numbers[kind].append(value.detach())
         self.critic_side.count(numbers, names=tuple(self.critics))
@@ -243,7 +243,7 @@ class Adversarial(Evaluated):
         loss = self.l1_weight * torch.stack(numbers["l1"]).sum()
         if self.critics:
             loss = loss + self.adversarial_weight * torch.stack(numbers["adversarial"]).sum()
-        self.manual_backward(loss)
+        self._backward(loss)
         self.critics.requires_grad_(True)
         self.net_side.count({"loss": [loss], **numbers}, names=tuple(pairs))
         return {"loss": loss.detach()}
@@ -284,6 +284,11 @@ class Adversarial(Evaluated):
             if name in watched and abs(value) > self.divergence_limit:
                 limit = f"beyond divergence_limit {self.divergence_limit:g}"
                 raise diverged(self, batch, f"{name} became {value:.4g}, {limit},")
+
+    def _backward(self, loss: Tensor) -> None:
+        """Add gradients, outside of the autocast that surrounds the training step."""
+        with torch.autocast(self.device.type, enabled=False):
+            self.manual_backward(loss)
 
     def _unsynchronised(self) -> AbstractContextManager[None]:
         """Return a context in which DDP sends no gradients."""
