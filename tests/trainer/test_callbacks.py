@@ -10,7 +10,14 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from models import WSKP
 from tests.synthetic import Synthetic, patch
-from trainer.callbacks import AtomicCheckpointIO, FiniteGuard, LastCheckpoint, ValidationPictures, recorder
+from trainer.callbacks import (
+    AtomicCheckpointIO,
+    ExportBest,
+    FiniteGuard,
+    LastCheckpoint,
+    ValidationPictures,
+    recorder,
+)
 from trainer.callbacks.progress import TrainingProgress, duration
 from trainer.callbacks.recorder import RunRecorder, flatten, git_state, installed
 from trainer.modules import Regression
@@ -161,6 +168,25 @@ def test_first_and_last_validated_epochs_are_pictured_and_some_between(options, 
         assert continued.due == first.due
         kept.append(continued.state_dict())
     assert whole == pictured
+
+
+def test_format_that_cannot_be_exported_leaves_the_others(first_rank, monkeypatch, capsys):
+    checkpoint = first_rank.folder / "checkpoints" / "best.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"x")
+    exported = []
+
+    def export(self, logger, checkpoint, format):
+        if format == "onnx":
+            raise ValueError("it differs")
+        exported.append(format)
+
+    monkeypatch.setattr(ExportBest, "_export", export)
+    ExportBest().on_fit_end(SimpleNamespace(logger=first_rank, is_global_zero=True), None)
+    assert exported == ["torchscript"]
+    said = capsys.readouterr().err
+    assert "The export failed: it differs" in said
+    assert f"trainer export --model {checkpoint} --format onnx" in said
 
 
 def test_durations_read_as_people_say_them():

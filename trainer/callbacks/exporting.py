@@ -38,34 +38,37 @@ class ExportBest(Callback):
         if chosen is None:
             return
         logger.log_file(chosen, "checkpoints")
+        for format in self.formats:
+            self._try(logger, chosen, format)
+
+    def _try(self, logger: MLflowTracking, checkpoint: Path, format: str) -> None:
+        """Export in one format; one that fails does not keep the others from being written."""
         from mlflow.exceptions import MlflowException
 
         try:
-            self._export(logger, chosen)
+            self._export(logger, checkpoint, format)
         except (ValueError, OSError, MlflowException) as error:
             logger.set_tags({"export.error": str(error)[:500]})
             print(
-                f"The export failed: {error}\nThe checkpoint is {chosen}; repeat with "
-                f"`trainer export --model {chosen} --format onnx --output DIR`.",
+                f"The export failed: {error}\nThe checkpoint is {checkpoint}; repeat with "
+                f"`trainer export --model {checkpoint} --format {format} --output DIR`.",
                 file=sys.stderr,
             )
 
-    def _export(self, logger: MLflowTracking, checkpoint: Path) -> None:
+    def _export(self, logger: MLflowTracking, checkpoint: Path, format: str) -> None:
         from trainer.export import SUFFIXES, export
         from trainer.loading import resolve
 
         loaded = resolve(str(checkpoint))
-        folder = logger.folder / "export"
-        for format in self.formats:
-            path = folder / f"{logger.registered_model or 'model'}{SUFFIXES[format]}"
-            parity = export(loaded.model, path, format, source=loaded.source, force=True)  # type: ignore[arg-type]
-            print(f"exported {path} (differs from eager by {parity.error:.1e})", file=sys.stderr)
-            logger.log_file(path, "export")
-            logger.set_tags({f"export.{format}.parity": f"{parity.error:.3e}"})
-            if format == "onnx" and self.register and logger.registered_model:
-                name = logger.registered_model
-                version = logger.call(partial(_register, logger, path, name))
-                print(f"registered models:/{name}/{version}", file=sys.stderr)
+        path = logger.folder / "export" / f"{logger.registered_model or 'model'}{SUFFIXES[format]}"
+        parity = export(loaded.model, path, format, source=loaded.source, force=True)  # type: ignore[arg-type]
+        print(f"exported {path} (differs from eager by {parity.error:.1e})", file=sys.stderr)
+        logger.log_file(path, "export")
+        logger.set_tags({f"export.{format}.parity": f"{parity.error:.3e}"})
+        if format == "onnx" and self.register and logger.registered_model:
+            name = logger.registered_model
+            version = logger.call(partial(_register, logger, path, name))
+            print(f"registered models:/{name}/{version}", file=sys.stderr)
 
 
 def _register(logger: MLflowTracking, path: Path, name: str, client: Any, run_id: str) -> str:
