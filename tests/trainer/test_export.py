@@ -52,6 +52,18 @@ class Baked(Blur):
         return Denoised(color * rows.mean() + rows.new_tensor(float(color.shape[-2])))
 
 
+class Rounded(Blur):
+    """Loses digits, other ones where it is traced."""
+
+    def __init__(self, eager: float, traced: float) -> None:
+        super().__init__()
+        self.eager, self.traced = eager, traced
+
+    def forward(self, buffers: Buffers) -> Denoised:
+        large = self.traced if torch.jit.is_tracing() else self.eager
+        return Denoised((super().forward(buffers).color + large) - large)
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("export")
@@ -277,3 +289,21 @@ def test_outputs_get_the_models_name_in_a_folder_and_the_suffix_must_fit(tmp_pat
         command.targets(tmp_path / "a.onnx", ["torchscript"], "x")
     with pytest.raises(ValueError, match="give a folder"):
         command.targets(tmp_path / "a.onnx", ["onnx", "torchscript"], "x")
+
+
+def test_a_file_as_exact_as_eager_is_written_although_both_round_by_more_than_the_limit(
+    tmp_path: Path,
+) -> None:
+    parity = export(Rounded(400.0, 200.0), tmp_path / "net.ts", "torchscript")
+    assert parity.error > LIMIT
+    assert LIMIT / 3 < parity.rounding < 1e-2
+    assert load_artifact(tmp_path / "net.ts").description.parity == parity
+
+
+@pytest.mark.parametrize(("eager", "traced"), [(0.0, 400.0), (20.0, 400.0), (1e5, 5e4)])
+def test_a_file_less_exact_than_eager_or_of_no_use_is_refused(
+    tmp_path: Path, eager: float, traced: float
+) -> None:
+    with pytest.raises(ValueError, match="the exported file differs by"):
+        export(Rounded(eager, traced), tmp_path / "net.ts", "torchscript")
+    assert not (tmp_path / "net.ts").exists()

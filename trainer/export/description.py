@@ -44,12 +44,14 @@ class Parity:
         limit: Largest error with which an artifact is accepted.
         sizes: (batch, height, width) of each comparison.
         runtime: What ran the artifact, with its version.
+        rounding: Where the error exceeds the limit: the eager module's own error against float64.
     """
 
     error: float
     limit: float
     sizes: tuple[tuple[int, int, int], ...]
     runtime: str
+    rounding: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ The error of an image is the largest `|artifact - eager| / (|eager| + 0.01 m)`, 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 
 import torch
@@ -17,6 +18,10 @@ from trainer.export.description import Parity
 from trainer.export.entry import example, numbers
 
 LIMIT = 1e-4
+ROUNDING = 2.0
+"""How much less exact than eager an artifact may be where float32 itself rounds by more than the limit."""
+UNUSABLE = 1e-2
+"""An error that no rounding excuses."""
 SIZES = ((1, 17, 31), (2, 63, 50), (1, 128, 128), (2, 45, 80), (3, 16, 97))
 """(batch, height, width): none is the size that was traced, most are odd."""
 
@@ -36,25 +41,46 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
     """Compare an artifact with the eager, deployed, float32 module on `SIZES`.
 
     Each size is run without frame numbers and with numbers unlike the defaults, on inputs with fireflies.
+    Networks that end in an exponential magnify rounding: where the difference exceeds the limit, both are
+    compared with the module in float64, and the artifact may be off by `ROUNDING` times what eager is.
 
     Raises:
-        ValueError: The artifact fails at a size or differs by more than `limit`; the message says where.
+        ValueError: The artifact fails at a size or differs by more than that; the message says where.
     """
-    worst = 0.0
+    worst = rounding = 0.0
     sizes = tuple((b, _round(h, denoiser.multiple), _round(w, denoiser.multiple)) for b, h, w in SIZES)
     for seed, (batch, height, width) in enumerate(sizes):
         plain = example(denoiser.inputs, batch, height, width, seed)
         _compare_measured(artifact, denoiser, plain)
         for buffers in (plain, plain | numbers(denoiser, plain)):
             place = f"batch {batch}, {width}x{height}"
+            expected = denoiser(buffers).color
             try:
-                error = relative_error(artifact(buffers).color, denoiser(buffers).color)
+                found = artifact(buffers).color
+                error = relative_error(found, expected)
             except Exception as failure:
                 raise ValueError(f"the exported file does not run at {place}: {failure}") from failure
             if not error <= limit:
-                raise ValueError(f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}")
+                own = _as_exact(found, expected, _in_double(denoiser, buffers))
+                if own is None:
+                    raise ValueError(
+                        f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}"
+                    )
+                rounding = max(rounding, own)
             worst = max(worst, error)
-    return Parity(worst, limit, sizes, runtime)
+    return Parity(worst, limit, sizes, runtime, rounding)
+
+
+def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
+    """Return what the module computes in float64."""
+    wide = {name: value.double() for name, value in buffers.items()}
+    return copy.deepcopy(denoiser).double()(wide).color
+
+
+def _as_exact(found: Tensor, eager: Tensor, exact: Tensor) -> float | None:
+    """Return eager's error against float64 where the artifact's is not much larger, otherwise None."""
+    own = relative_error(eager.double(), exact)
+    return own if relative_error(found.double(), exact) <= ROUNDING * own < UNUSABLE else None
 
 
 def _compare_measured(artifact: Artifact, denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> None:
