@@ -28,6 +28,7 @@ from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint
 from trainer.tracking import open_client
 
 NAMES = ("noisy", "accumulated", "joint bilateral", "WSKP")
+SHOWN = tuple(name for name, measure in METRICS.items() if measure.source == "wskp")
 MARKERS = ("<!-- quality -->", "<!-- /quality -->")
 BY_ACCUMULATED_DB, BY_BILATERAL_DB = 4.0, 1.0
 
@@ -100,10 +101,10 @@ def waiting(checkpoint: Path) -> list[dict[str, Any]]:
 
 def write_readme(table: dict[str, dict[str, float]], readme: Path) -> None:
     """Put the table between the README's two markers."""
-    lines = ["| | " + " | ".join(METRICS) + " |", "|---" * (len(METRICS) + 1) + "|"]
+    lines = ["| | " + " | ".join(SHOWN) + " |", "|---" * (len(SHOWN) + 1) + "|"]
     for name in NAMES:
         cells = [
-            f"{table[name][m]:.2f} dB" if m.startswith("psnr") else f"{table[name][m]:.4f}" for m in METRICS
+            f"{table[name][m]:.2f} dB" if m.startswith("psnr") else f"{table[name][m]:.4f}" for m in SHOWN
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     before, rest = readme.read_text().split(MARKERS[0])
@@ -131,7 +132,7 @@ def run(
         rows.append({"name": f"WSKP above {other}, psnr_wskp", "value": gain, "unit": "dB",
                      "target": f">= {target_db} dB", "meets": gain >= target_db})  # fmt: skip
     for name in NAMES:
-        for metric in METRICS:
+        for metric in SHOWN:
             unit = "dB" if metric.startswith("psnr") else ""
             rows.append({"name": f"{name} {metric}", "value": table[name][metric], "unit": unit})
     return rows

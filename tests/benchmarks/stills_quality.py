@@ -5,7 +5,7 @@ adversarial loss, unless the current directory has runs of them (`runs/stills_<m
 best checkpoints with the noisy input and with the filters without parameters. Times are those of trainings
 done here; four trainings take the better part of an hour on two idle cores.
 
-    python -m tests.benchmarks.stills_quality [--picture FILE] [--train METHOD …]
+    python -m tests.benchmarks.stills_quality [--picture FILE] [--readme FILE] [--train METHOD …]
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ METHODS: dict[str, tuple[str, ...]] = {
 """Method → its configurations, `<name>_tungsten.yaml` and `<name>_sample.yaml`, and further options."""
 
 TITLES = {"kpcn": "KPCN", "acfm": "ACFM", "afgsa_l1": "AFGSA without adversarial loss", "afgsa": "AFGSA"}
-FILTERS = tuple(name for name in ("JointBilateral", "NFOR") if name in models.__all__)
+FILTERS = {"JointBilateral": "joint bilateral", "NFOR": "NFOR"}
 SHOWN = ("psnr_afgsa", "ssim_afgsa", "rel_mse_half_afgsa", "psnr_wskp", "ssim_wskp_range1", "relmse_layer")
 LIMIT_MINUTES = 40.0
+MARKERS = ("<!-- stills -->", "<!-- /stills -->")
 
 
 class Scored(NamedTuple):
@@ -86,23 +87,37 @@ def score(nets: dict[str, Denoiser]) -> Scored:
 
 
 def picture(images: dict[str, Tensor], path: Path) -> None:
-    """Write the images of one frame side by side, with their names."""
-    from trainer.reports.pictures import tone_map
+    """Write the exposed images of one frame in two rows, with names and PSNR."""
+    from trainer.reports.pictures import Panel, grid, tone_map
 
-    tiles = [tone_map(image[0].permute(1, 2, 0).numpy()) for image in images.values()]
-    sheet = Image.new("RGB", (sum(tile.width for tile in tiles), tiles[0].height))
-    left = 0
-    for tile in tiles:
-        sheet.paste(tile, (left, 0))
-        left += tile.width
+    panels = []
+    for name, image in images.items():
+        tile = tone_map(image[0].permute(1, 2, 0).numpy())
+        score = METRICS["psnr_afgsa"].function(image, images["reference"])
+        caption = "" if name == "reference" else f"PSNR {float(score):.2f} dB"
+        tile = tile.resize((2 * tile.width, 2 * tile.height), Image.Resampling.NEAREST)
+        panels.append(Panel(tile, name, caption))
+    half = -(-len(panels) // 2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(path)
-    print(f"{path}: {', '.join(images)}, from left to right")
+    grid([panels[:half], panels[half:]]).save(path)
 
 
-def run(target: Path | None = None) -> list[Row]:
+def write_readme(scores: dict[str, dict[str, float]], readme: Path) -> None:
+    """Put the table of scores between the README's two markers."""
+    lines = ["| | " + " | ".join(SHOWN) + " |", "|---" * (len(SHOWN) + 1) + "|"]
+    for name, values in scores.items():
+        cells = [METRICS[metric].format.format(values[metric]) for metric in SHOWN]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    before, rest = readme.read_text().split(MARKERS[0])
+    after = rest.split(MARKERS[1])[1]
+    readme.write_text(before + MARKERS[0] + "\n" + "\n".join(lines) + "\n" + MARKERS[1] + after)
+
+
+def run(target: Path | None = None, readme: Path | None = None) -> list[Row]:
     """Return the rows of figure 4: every method and metric, and the time of what was trained now."""
-    nets: dict[str, Denoiser] = {name: getattr(models, name)().eval() for name in FILTERS}
+    nets: dict[str, Denoiser] = {
+        title: getattr(models, name)().eval() for name, title in FILTERS.items() if name in models.__all__
+    }
     rows: list[Row] = []
     for method in METHODS:
         checkpoint, minutes = train(method)
@@ -115,6 +130,8 @@ def run(target: Path | None = None) -> list[Row]:
     scores, images = score(nets)
     if target:
         picture(images, target)
+    if readme:
+        write_readme(scores, readme)
     for name, values in scores.items():
         rows += [
             row(f"{name}: {metric}", values[metric], "dB" if "dB" in METRICS[metric].format else "")
@@ -126,10 +143,11 @@ def run(target: Path | None = None) -> list[Row]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--picture", type=Path, help="write the images of the held-out frame side by side")
+    parser.add_argument("--readme", type=Path, help="write the scores into this file")
     parser.add_argument("--train", nargs="+", choices=tuple(METHODS), help="train these and nothing else")
     options = parser.parse_args()
     if options.train:
         for wanted in options.train:
             print(*train(wanted))
     else:
-        print_table(run(options.picture))
+        print_table(run(options.picture, options.readme))
