@@ -94,6 +94,7 @@ def uninterrupted(tmp_path_factory, cache):
     return final(place)
 
 
+@pytest.mark.slow
 def test_killed_run_continues_in_its_run_with_identical_denoiser_and_critic(workplace, uninterrupted):
     process = workplace.start(*options(workplace, 2, 7), *ADAM)
     step = wait_for_step(workplace, 4, process)
