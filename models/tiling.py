@@ -86,7 +86,7 @@ def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int
     """
     per_pixel = int(getattr(denoiser, "bytes_per_pixel", BYTES_PER_PIXEL)) * batch
     once = int(getattr(denoiser, "bytes_once", 0))
-    halo, multiple = _aligned_halo(denoiser), denoiser.multiple
+    halo, multiple = aligned_halo(denoiser), denoiser.multiple
     (tall, wide), pixels = size, max(budget - once, 0) // per_pixel
     smallest = _round_up(SMALLEST_CORE, multiple)
     found: list[tuple[int, tuple[int, int]]] = []
@@ -153,8 +153,7 @@ def denoise_tiled(
         ValueError: A buffer is missing, sizes differ, or the budget is too small.
     """
     batch, height, width = _size(denoiser, buffers)
-    numbers = {name: buffers[name] for name in denoiser.frame_numbers if name in buffers}
-    numbers = {**denoiser.measure(buffers), **numbers}
+    numbers = numbers_of_frame(denoiser, buffers)
     multiple = denoiser.multiple
     images = {name: _padded(buffers[name], multiple) for name in denoiser.inputs}
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
@@ -163,7 +162,7 @@ def denoise_tiled(
         core = core_size(denoiser, (tall, wide), budget, batch)
     else:
         core = (_even(tall, max(tile, 1), multiple), _even(wide, max(tile, 1), multiple))
-    for piece in tiles(tall, wide, core, _aligned_halo(denoiser)):
+    for piece in tiles(tall, wide, core, aligned_halo(denoiser)):
         rows, columns = piece.read
         part = {name: image[..., rows, columns].contiguous() for name, image in images.items()}
         color = _color(denoiser({**part, **numbers}))
@@ -175,6 +174,12 @@ def denoise_tiled(
         result[..., piece.core[0], piece.core[1]] = color[..., inner_rows, inner_columns]
     assert result is not None
     return result[..., :height, :width]
+
+
+def numbers_of_frame(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the frame numbers that parts of a frame are denoised with: given ones, and measured ones."""
+    given = {name: buffers[name] for name in denoiser.frame_numbers if name in buffers}
+    return {**denoiser.measure(buffers), **given}
 
 
 def _size(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> tuple[int, int, int]:
@@ -192,7 +197,7 @@ def _size(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> tuple[int, int, 
     return first.shape[0], first.shape[-2], first.shape[-1]
 
 
-def _aligned_halo(denoiser: Tileable) -> int:
+def aligned_halo(denoiser: Tileable) -> int:
     """Round the halo up, so that tiles start where the method's own grid of `multiple` pixels does."""
     return _round_up(denoiser.halo, denoiser.multiple)
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.tiling import Tileable
+from models.tiling import Tileable, aligned_halo, numbers_of_frame
 from trainer.export.artifact import Artifact
 from trainer.loading import Model
 
@@ -91,8 +91,7 @@ def attention_of(model: Attentive, buffers: Mapping[str, Tensor], query: tuple[i
     height, width = buffers[model.inputs[0]].shape[-2:]
     inside(query, width, height)
     columns, rows = _around(query[0], width, model), _around(query[1], height, model)
-    numbers = {name: buffers[name] for name in model.frame_numbers if name in buffers}
-    numbers = {**model.measure(buffers), **numbers}
+    numbers = numbers_of_frame(model, buffers)
     crop = {name: buffers[name][..., rows, columns].contiguous() for name in model.inputs}
     with torch.inference_mode():
         maps = model.attention({**crop, **numbers}, query[1] - rows.start, query[0] - columns.start)
@@ -106,8 +105,7 @@ def attention_of(model: Attentive, buffers: Mapping[str, Tensor], query: tuple[i
 
 def _around(position: int, size: int, model: Attentive) -> slice:
     """Return the block of a pixel with its halo, on the model's own grid, cut where the image ends."""
-    multiple = model.multiple
-    halo = -(-model.halo // multiple) * multiple
+    multiple, halo = model.multiple, aligned_halo(model)
     start = position // multiple * multiple
     return slice(max(0, start - halo), min(size, start + multiple + halo))
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler, ReduceLROnPlateau
+
+MakeOptimizer = Callable[[Iterable], Optimizer]
+MakeSchedule = Callable[[Optimizer], LRScheduler]
 
 
 class OneCycle(LambdaLR):
@@ -94,3 +97,26 @@ class Halving(LambdaLR):
     def factor(self, count: int) -> float:
         """Return the learning rate after `count` epochs or steps as a fraction of the first."""
         return float(self.decay ** bisect.bisect_right(self.milestones, count))
+
+
+def scheduled(optimizer: Optimizer, make: MakeSchedule | None, steps: float, owner: str) -> dict[str, Any]:
+    """Return an optimiser and its schedule as Lightning takes them.
+
+    Args:
+        optimizer: The optimiser.
+        make: Makes its schedule, stepped as often as its attribute `interval` says, every epoch without one.
+        steps: Steps of the optimiser in the whole training.
+        owner: Who trains, for messages.
+
+    Raises:
+        ValueError: The schedule waits for a score, which is not known here.
+    """
+    if make is None:
+        return {"optimizer": optimizer}
+    schedule = make(optimizer)
+    if isinstance(schedule, ReduceLROnPlateau):
+        raise ValueError(f"{owner} cannot use ReduceLROnPlateau; use trainer.schedules.Halving or OneCycle")
+    if isinstance(schedule, OneCycle):
+        schedule.span(int(steps))
+    interval = getattr(schedule, "interval", "epoch")
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": interval}}

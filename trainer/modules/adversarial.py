@@ -38,18 +38,8 @@ from models.denoiser import Denoiser, Pair
 from trainer.divergence import diverged
 from trainer.modules.evaluation import Batch, Evaluated
 from trainer.modules.penalty import gradient_penalty, mixing
-from trainer.modules.updates import (
-    MakeOptimizer,
-    MakeSchedule,
-    Side,
-    Turn,
-    advance,
-    check_crops,
-    check_groups,
-    check_number,
-    scheduled,
-    turn,
-)  # fmt: skip
+from trainer.modules.updates import Side, Turn, advance, check_crops, check_groups, check_number, turn
+from trainer.schedules import MakeOptimizer, MakeSchedule, scheduled
 
 
 class Adversarial(Evaluated):
@@ -160,10 +150,11 @@ class Adversarial(Evaluated):
         for group in optimizer.param_groups:
             group["lr"] *= self.lr_scales.get(group["name"], 1.0)
         steps = self.trainer.estimated_stepping_batches
-        made = [scheduled(optimizer, self.make_lr_scheduler, steps)]
+        made = [scheduled(optimizer, self.make_lr_scheduler, steps, "Adversarial")]
         if self.critics:
             optimizer = self.make_critic_optimizer(self.critics.parameters())
-            made.append(scheduled(optimizer, self.make_critic_lr_scheduler, steps * self.critic_steps))
+            updates = steps * self.critic_steps
+            made.append(scheduled(optimizer, self.make_critic_lr_scheduler, updates, "Adversarial"))
         return made
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:

@@ -16,15 +16,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from models.denoiser import Denoiser
 from trainer.losses import L1
 from trainer.modules.evaluation import Batch, Evaluated
-from trainer.schedules import OneCycle
+from trainer.schedules import MakeOptimizer, MakeSchedule, scheduled
 
 JOINT = "color"
 """Name of the pair that is compared in the joint phase."""
@@ -61,8 +59,8 @@ class Branches(Evaluated):
         loss: nn.Module | None = None,
         joint_after: int | float = 0.75,
         joint_lr: float | None = 1e-6,
-        optimizer: Callable[[Iterable], Optimizer] = adam,
-        lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        optimizer: MakeOptimizer = adam,
+        lr_scheduler: MakeSchedule | None = None,
     ) -> None:
         super().__init__(net)
         self.keep_arguments()
@@ -107,18 +105,12 @@ class Branches(Evaluated):
         loss: Tensor = self.loss(output, target)
         return loss
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
+    def configure_optimizers(self) -> dict[str, Any]:  # type: ignore[override]
         """Return the optimiser, with its schedule if there is one, and find the first joint step."""
         steps = self.trainer.estimated_stepping_batches
         self.joint_step = self._first_joint_step(steps)
         optimizer = self.make_optimizer(self.net.parameters())
-        if self.make_lr_scheduler is None:
-            return optimizer
-        schedule = self.make_lr_scheduler(optimizer)
-        if isinstance(schedule, OneCycle):
-            schedule.span(int(steps))
-        interval = getattr(schedule, "interval", "epoch")
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": interval}}
+        return scheduled(optimizer, self.make_lr_scheduler, steps, "Branches")
 
     def optimizer_step(
         self,

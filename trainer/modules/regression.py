@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from models.denoiser import Denoiser
 from trainer.losses import SMAPE
 from trainer.modules.evaluation import Batch, Evaluated
-from trainer.schedules import OneCycle
+from trainer.schedules import MakeOptimizer, MakeSchedule, scheduled
 
 
 class Regression(Evaluated):
@@ -34,8 +31,8 @@ class Regression(Evaluated):
         self,
         net: Denoiser,
         loss: nn.Module | None = None,
-        optimizer: Callable[[Iterable], Optimizer] = torch.optim.Adam,
-        lr_scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        optimizer: MakeOptimizer = torch.optim.Adam,
+        lr_scheduler: MakeSchedule | None = None,
     ) -> None:
         super().__init__(net)
         self.keep_arguments()
@@ -55,13 +52,8 @@ class Regression(Evaluated):
         loss: Tensor = self.loss(output, target)
         return loss
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
+    def configure_optimizers(self) -> dict[str, Any]:  # type: ignore[override]
         """Return the optimiser, with its schedule if there is one."""
         optimizer = self.make_optimizer(self.net.parameters())
-        if self.make_lr_scheduler is None:
-            return optimizer
-        schedule = self.make_lr_scheduler(optimizer)
-        if isinstance(schedule, OneCycle):
-            schedule.span(int(self.trainer.estimated_stepping_batches))
-        interval = getattr(schedule, "interval", "epoch")
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": interval}}
+        steps = self.trainer.estimated_stepping_batches
+        return scheduled(optimizer, self.make_lr_scheduler, steps, "Regression")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from lightning.pytorch import Trainer
@@ -12,13 +12,8 @@ from torch import Tensor, distributed, nn
 from torch.nn import Parameter
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from models.denoiser import Denoiser, Pair
-from trainer.schedules import OneCycle
-
-MakeOptimizer = Callable[[Iterable], Optimizer]
-MakeSchedule = Callable[[Optimizer], LRScheduler]
 
 
 class Turn(NamedTuple):
@@ -119,30 +114,11 @@ class Side:
         self._batches, self._sums = 0, {}
 
 
-def scheduled(optimizer: Optimizer, make: MakeSchedule | None, steps: float) -> dict[str, Any]:
-    """Return an optimiser and its schedule as Lightning takes them.
-
-    Raises:
-        ValueError: The schedule waits for a score, which is not known here.
-    """
-    if make is None:
-        return {"optimizer": optimizer}
-    schedule = make(optimizer)
-    if isinstance(schedule, ReduceLROnPlateau):
-        raise ValueError(
-            "Adversarial cannot use ReduceLROnPlateau; use trainer.schedules.Halving or OneCycle"
-        )
-    if isinstance(schedule, OneCycle):
-        schedule.span(int(steps))
-    return {"optimizer": optimizer, "lr_scheduler": schedule}
-
-
 def advance(trainer: Trainer, optimizer: Optimizer, interval: str) -> None:
     """Step the schedules of an optimiser that count `interval`, step or epoch."""
     for config in trainer.lr_scheduler_configs:
-        schedule = config.scheduler
-        if schedule.optimizer is optimizer and getattr(schedule, "interval", "epoch") == interval:
-            schedule.step()  # type: ignore[call-arg]
+        if config.scheduler.optimizer is optimizer and config.interval == interval:
+            config.scheduler.step()  # type: ignore[call-arg]
 
 
 def check_crops(critics: nn.ModuleDict, pairs: Mapping[str, Pair]) -> None:
