@@ -6,10 +6,24 @@
 
 from models.acfm import ACFM
 from models.afgsa import AFGSA
+from models.classical.cross_bilateral import CrossBilateral
 from models.classical.joint_bilateral import JointBilateral
+from models.classical.nfor import NFOR
+from models.classical.nlm import NLM, JointNLM, MultiScaleNLM
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN
 from models.wskp import WSKP
 
-__all__ = ["ACFM", "AFGSA", "KPCN", "WSKP", "JointBilateral"]
+__all__ = [
+    "ACFM",
+    "AFGSA",
+    "KPCN",
+    "NFOR",
+    "NLM",
+    "WSKP",
+    "CrossBilateral",
+    "JointBilateral",
+    "JointNLM",
+    "MultiScaleNLM",
+]

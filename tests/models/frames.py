@@ -24,21 +24,26 @@ def random_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[s
 
 
 def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
-    """Return those and color, its diffuse and specular parts, references, and the variance of each."""
+    """Return those and color, its diffuse and specular parts, references, halves and variances."""
     buffers = lit(random_buffers(batch, height, width, seed))
     generator = torch.Generator().manual_seed(seed + 1000)
     for name in ("color", "diffuse", "specular", "albedo", "normal", "depth"):
         spread = torch.rand(buffers[name].shape, generator=generator) ** 4
         buffers[f"{name}_variance"] = 0.05 * spread * buffers[name].square()
+    for name in ("albedo", "normal", "depth"):
+        shift = 0.05 * torch.rand(buffers[name].shape, generator=generator) * buffers[name]
+        buffers[f"{name}_a"], buffers[f"{name}_b"] = buffers[name] + shift, buffers[name] - shift
     for name, source in (("reference", "color"), ("reference_diffuse", "diffuse")):
         buffers[name] = torch.nn.functional.avg_pool2d(buffers[source], 5, 1, 2)
     return buffers
 
 
 def lit(buffers: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the buffers with color, diffuse and specular as irradiance and albedo make them."""
+    """Return the buffers with color, its halves, diffuse and specular as irradiance and albedo make them."""
     color = buffers["irradiance"] * buffers["albedo"]
-    return {**buffers, "color": color, "diffuse": 0.75 * color, "specular": 0.25 * color}
+    shift = 0.3 * color * torch.linspace(-1, 1, color.numel()).reshape(color.shape).mul(1e4).sin()
+    halves = {"color_a": color + shift, "color_b": color - shift}
+    return {**buffers, "color": color, "diffuse": 0.75 * color, "specular": 0.25 * color, **halves}
 
 
 def luminous(buffers: dict[str, Tensor], value: float) -> dict[str, Tensor]:
