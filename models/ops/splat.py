@@ -1,0 +1,277 @@
+"""Kernel splat: every pixel of every sample or layer spreads its value over its neighbours.
+
+    total(p + q) += w_q(n, p) values(n, p),      weight(p + q) += w_q(n, p),      over images n and pixels p
+
+with q over the K x K offsets, row by row; offsets that leave the image are dropped. The result is
+total / (weight + eps), with what a paper adds.
+
+Weights are predicted, exp(logit - shift). Two rules exist for the shift, and they are not the same filter.
+Munkberg and Hasselgren 2020 (doi:10.1111/cgf.14049) subtract the largest logit of the pixel that splats:
+`splat_exp`. Gharbi et al. 2019 (doi:10.1145/3306346.3322954) subtract the largest logit that arrives, a true
+softmax over all contributions of a pixel: `models.ops.arrivals`.
+
+Everything runs in float32, or float64 for float64 values, also under mixed precision, is differentiable once
+and keeps logits and values only: weights are computed again in the backward pass (`models.ops.kernel_blocks`).
+Memory beyond inputs, outputs and gradients does not grow with the kernels.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from models.ops import kernel_graph as graph
+from models.ops.boxes import exporting
+from models.ops.kernel_blocks import Kernels, collect, scatter, slopes
+from models.ops.precision import wide
+
+
+class Splatted(NamedTuple):
+    """What arrives at every pixel.
+
+    Attributes:
+        total: Weighted values (B, C, H, W), summed.
+        weight: Weights (B, 1, H, W), summed.
+    """
+
+    total: Tensor
+    weight: Tensor
+
+
+def splat(values: Tensor, weights: Tensor, size: int) -> Splatted:
+    """Splat values with given weights; the adjoint of `gather_weighted`.
+
+    Args:
+        values: (B, N, C, H, W), of N samples or layers.
+        weights: (B, N, K * K, H, W); map `K * (dy + r) + dx + r` weighs what goes to the pixel dy rows below
+            and dx columns to the right, r = (K - 1) / 2.
+        size: K, odd.
+
+    Raises:
+        ValueError: K is even, there are not K * K weights, or sizes differ.
+    """
+    return _splatted(values, weights, size)
+
+
+def splat_exp(values: Tensor, logits: Tensor, size: int, shift: Tensor | None = None) -> Splatted:
+    """Splat values with weights exp(logit - shift), the shift being that of the pixel that splats.
+
+    Args:
+        values: (B, N, C, H, W), of N samples or layers.
+        logits: (B, N, K * K, H, W), in the order of `splat`.
+        size: K, odd.
+        shift: (B, 1 or N, 1, H, W). None: the largest logit of the pixel over all taps and all N, so that
+            the largest weight is 1. Where samples come one at a time it is their common maximum. It has a
+            gradient, since the result is no function of differences alone.
+
+    Raises:
+        ValueError: As for `splat`, or the shift has another shape.
+    """
+    if shift is None and not exporting():
+        return _splatted(values, logits, size, *_largest(logits.detach()))
+    return _splatted(values, logits, size, source_maximum(logits) if shift is None else shift)
+
+
+def splat_shifted(values: Tensor, logits: Tensor, size: int, shift: Tensor) -> Splatted:
+    """Splat values with weights exp(logit - shift), the shift being that of the pixel that is reached.
+
+    Args:
+        values: (B, N, C, H, W), of N samples or layers.
+        logits: (B, N, K * K, H, W), in the order of `splat`.
+        size: K, odd.
+        shift: (B, 1, H, W), a constant for the gradient; at least about the largest logit that arrives.
+
+    Raises:
+        ValueError: As for `splat_exp`.
+    """
+    return _splatted(values, logits, size, target=shift.detach())
+
+
+def source_maximum(logits: Tensor) -> Tensor:
+    """Return the largest logit of every pixel over N images and all taps, (B, 1, 1, H, W)."""
+    return logits.amax((1, 2), keepdim=True)
+
+
+def gather_weighted(image: Tensor, weights: Tensor, size: int) -> Tensor:
+    """Return for every pixel the sum of its neighbours with its own weights; outside the image is nothing.
+
+    The adjoint of `splat`. `models.ops.gather` filters with softmax weights and other borders.
+
+    Args:
+        image: (B, C, H, W).
+        weights: (B, K * K, H, W); map `K * (dy + r) + dx + r` weighs the pixel dy rows below and dx columns
+            to the right.
+        size: K, odd.
+
+    Returns:
+        (B, C, H, W), not divided by the weights.
+
+    Raises:
+        ValueError: As for `splat`.
+    """
+    return _gathered(image, weights, size)
+
+
+def gather_inside(image: Tensor, logits: Tensor, size: int) -> Tensor:
+    """Filter an image with kernels of which only the part inside the image counts.
+
+    The softmax of each pixel runs over the offsets that stay in the image.
+
+    Args:
+        image: (B, C, H, W).
+        logits: (B, K * K, H, W).
+        size: K, odd.
+
+    Returns:
+        (B, C, H, W).
+
+    Raises:
+        ValueError: As for `splat`.
+    """
+    both = torch.cat([wide(image), torch.ones_like(wide(image[:, :1]))], 1)
+    if not exporting():
+        _check(both[:, None], logits[:, None], size)
+    sums = _gathered(both, logits, size, _inside_maximum(logits.detach(), size, both.dtype))
+    return sums[:, :-1] / sums[:, -1:]
+
+
+def _inside_maximum(logits: Tensor, size: int, dtype: torch.dtype) -> Tensor:
+    """Return the largest logit of every pixel over the offsets that stay in the image, (B, 1, H, W)."""
+    if exporting():
+        return graph.inside_maximum(logits, size)
+    batch, _, height, width = logits.shape
+    reach = size // 2
+    out = logits.new_full((batch, 1, height, width), -torch.inf, dtype=dtype)
+    for index in range(size * size):
+        dy, dx = divmod(index, size)
+        rows = slice(max(0, reach - dy), max(0, min(height, height + reach - dy)))
+        columns = slice(max(0, reach - dx), max(0, min(width, width + reach - dx)))
+        part = out[:, 0, rows, columns]
+        torch.maximum(part, logits[:, index, rows, columns].to(dtype), out=part)
+    return out
+
+
+def _splatted(
+    values: Tensor,
+    numbers: Tensor,
+    size: int,
+    source: Tensor | None = None,
+    index: Tensor | None = None,
+    target: Tensor | None = None,
+) -> Splatted:
+    values = wide(values)
+    if not exporting():
+        _check(values, numbers, size)
+    if source is not None:
+        source = source.to(values.dtype).expand(values[:, :, :1].shape)
+    if target is not None:
+        target = target.to(values.dtype)
+    if exporting():
+        sums = graph.scatter(values, graph.weights(numbers.to(values.dtype), size, source, target), size)
+    elif torch.is_grad_enabled() and any(
+        t is not None and t.requires_grad for t in (values, numbers, source)
+    ):
+        sums = _Splat.apply(values, numbers, source, target, index, size)
+    else:
+        sums = scatter(Kernels(numbers, size, values.dtype, source, target), values)
+    return Splatted(sums[:, :-1], sums[:, -1:])
+
+
+def _largest(logits: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `source_maximum` and which of all N * K * K logits it is, (B, 1, H, W)."""
+    taps = logits.shape[2]
+    largest, index = logits[:, 0].max(1, keepdim=True)
+    for n in range(1, logits.shape[1]):
+        value, place = logits[:, n].max(1, keepdim=True)
+        index = torch.where(value > largest, place + n * taps, index)
+        largest = torch.maximum(value, largest)
+    return largest[:, None], index
+
+
+def _gathered(image: Tensor, numbers: Tensor, size: int, source: Tensor | None = None) -> Tensor:
+    image = wide(image)[:, None]
+    numbers = numbers[:, None]
+    source = None if source is None else source[:, None]
+    if exporting():
+        return graph.collect(image, graph.weights(numbers.to(image.dtype), size, source, None), size)[:, 0]
+    _check(image, numbers, size)
+    if torch.is_grad_enabled() and (image.requires_grad or numbers.requires_grad):
+        result: Tensor = _Gather.apply(image, numbers, source, size)
+        return result[:, 0]
+    return collect(Kernels(numbers, size, image.dtype, source), image)[:, 0]
+
+
+def _check(values: Tensor, numbers: Tensor, size: int) -> None:
+    if size < 1 or size % 2 == 0:
+        raise ValueError(f"kernel size {size}; expected an odd number")
+    batch, count, _, height, width = values.shape
+    expected = (batch, count, size * size, height, width)
+    if tuple(numbers.shape) != expected:
+        raise ValueError(
+            f"weights or logits of {size}x{size} kernels have shape {tuple(numbers.shape)}, expected {expected} "
+            f"for values of shape {tuple(values.shape)}"
+        )
+
+
+class _Splat(torch.autograd.Function):
+    """`scatter` with a backward pass that computes the weights again.
+
+    With incoming gradients g (of totals) and h (of weights), and a_q(p) = h(p + q) + <values(p), g(p + q)>:
+
+        dL/d(values) = sum_q w_q g(p + q),   dL/d(weight_q) = a_q,   dL/d(logit_q) = w_q a_q,
+        dL/d(shift) = - sum_q w_q a_q   for the shift of the pixel that splats
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        values: Tensor,
+        numbers: Tensor,
+        source: Tensor | None,
+        target: Tensor | None,
+        index: Tensor | None,
+        size: int,
+    ) -> Tensor:
+        ctx.save_for_backward(values, numbers, source, target, index)
+        ctx.size = size
+        return scatter(Kernels(numbers, size, values.dtype, source, target), values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        values, numbers, source, target, index = ctx.saved_tensors
+        kernels = Kernels(numbers, ctx.size, values.dtype, source, target)
+        for_values, for_numbers, for_source = ctx.needs_input_grad[:3]
+        wanted = (for_values, for_numbers, for_source or (for_numbers and index is not None))
+        d_values, d_numbers, d_source = slopes(kernels, values, gradient[:, None], wanted)
+        if index is not None and d_numbers is not None and d_source is not None:
+            # The shift is one of the logits: its gradient goes there.
+            change = d_source.sum(1).to(d_numbers.dtype)
+            d_numbers.view(len(change), -1, *change.shape[-2:]).scatter_add_(1, index, change)
+        return d_values, d_numbers, d_source if for_source else None, None, None, None
+
+
+class _Gather(torch.autograd.Function):
+    """`collect` with a backward pass that computes the weights again.
+
+    dL/d(image) splats the incoming gradient g; dL/d(weight_q) = <g(p), image(p + q)>, times w_q for a logit.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, numbers: Tensor, source: Tensor | None, size: int) -> Tensor:
+        ctx.save_for_backward(image, numbers, source)
+        ctx.size = size
+        return collect(Kernels(numbers, size, image.dtype, source), image)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        image, numbers, source = ctx.saved_tensors
+        kernels = Kernels(numbers, ctx.size, image.dtype, source)
+        for_image, for_numbers = ctx.needs_input_grad[:2]
+        d_image = scatter(kernels, gradient)[:, None, :-1] if for_image else None
+        d_numbers = slopes(kernels, gradient, image, (False, for_numbers, False)).numbers
+        return d_image, d_numbers, None, None
