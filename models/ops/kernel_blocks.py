@@ -22,8 +22,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_CHUNK = 1 << 16
-"""Numbers of a block on a CPU: five blocks, of which a scatter keeps as many, fill 1.3 MB of cache."""
+_CHUNK = 1 << 17
+"""Numbers of a block on a CPU. A scatter of three channels keeps five blocks, 2.6 MB of cache on two cores."""
 
 _CHUNK_DEVICE = 1 << 24
 """The same on other devices, where calls cost more and memory less."""
@@ -47,8 +47,8 @@ class Kernels:
         size: K, odd.
         dtype: What weights are computed in.
         source: Subtracted before exp at the pixel that owns the kernel, (B, N, 1, H, W).
-        target: Subtracted before exp at the pixel that is reached, (B, 1, H, W). With neither of them the
-            numbers are the weights.
+        target: Subtracted before exp at the pixel that is reached, (B, 1, H, W); offsets that leave the image
+            get weight 0, whatever their numbers. Without any shift the numbers are the weights.
     """
 
     numbers: Tensor
@@ -79,13 +79,16 @@ class Kernels:
     def block(self, rows: slice, dy: int, out: Tensor) -> None:
         """Write the weights of one row of taps, (K, rows, W); for the kernels of one image."""
         numbers = self.numbers[dy * self.size : (dy + 1) * self.size, rows]
-        if self.source is not None:
-            torch.sub(numbers.to(self.dtype), self.source[:, rows], out=out).exp_()
-        elif self.target is not None:
-            seen = windows(self.target, numbers.shape[-1])[0, :, rows.start + dy : rows.stop + dy]
-            torch.sub(numbers.to(self.dtype), seen, out=out).exp_()
-        else:
+        if not self.exponential:
             out.copy_(numbers)
+            return
+        shifted = numbers.to(self.dtype)
+        if self.source is not None:
+            shifted = torch.sub(shifted, self.source[:, rows], out=out)
+        if self.target is not None:
+            seen = windows(self.target, numbers.shape[-1])[0, :, rows.start + dy : rows.stop + dy]
+            torch.sub(shifted, seen, out=out)
+        out.exp_()
 
 
 def windows(padded: Tensor, width: int) -> Tensor:

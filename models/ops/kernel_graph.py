@@ -18,10 +18,10 @@ _FAR = 1e4
 def weights(numbers: Tensor, size: int, source: Tensor | None, target: Tensor | None) -> Tensor:
     """Return numbers, or their exponentials after a shift, (B, N, K * K, H, W); see `Kernels`."""
     if source is not None:
-        return torch.exp(numbers - source)
+        numbers = numbers - source
     if target is not None:
-        return torch.exp(numbers - _neighbours(target, size, _FAR)[:, None])
-    return numbers
+        numbers = numbers - _neighbours(target, size, _FAR)[:, None]
+    return numbers if source is None and target is None else torch.exp(numbers)
 
 
 def scatter(values: Tensor, kernels: Tensor, size: int) -> Tensor:
@@ -42,12 +42,8 @@ def collect(image: Tensor, kernels: Tensor, size: int) -> Tensor:
 
 def arriving_maximum(numbers: Tensor, size: int, outside: float) -> Tensor:
     """Return the largest number that reaches each pixel (B, 1, H, W); those from outside count as given."""
-    largest = numbers[:, 0] if numbers.shape[1] == 1 else None
-    if largest is None:
-        shape = numbers.shape
-        arrived = _arrived(numbers.flatten(0, 1), size, outside).reshape(shape)
-        return arrived.amax((1, 2))[:, None]
-    return _arrived(largest, size, outside).amax(1, keepdim=True)
+    arrived = _arrived(numbers.flatten(0, 1), size, outside).reshape(numbers.shape)
+    return arrived.amax((1, 2))[:, None]
 
 
 def inside_maximum(numbers: Tensor, size: int) -> Tensor:

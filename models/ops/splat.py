@@ -71,7 +71,8 @@ def splat_exp(values: Tensor, logits: Tensor, size: int, shift: Tensor | None = 
         ValueError: As for `splat`, or the shift has another shape.
     """
     if shift is None and not exporting():
-        return _splatted(values, logits, size, *_largest(logits.detach()))
+        _check(values, logits, size)
+        return _splatted(values, logits, size, *_largest(logits.detach(), size))
     return _splatted(values, logits, size, source_maximum(logits) if shift is None else shift)
 
 
@@ -180,28 +181,30 @@ def _splatted(
     return Splatted(sums[:, :-1], sums[:, -1:])
 
 
-def _largest(logits: Tensor) -> tuple[Tensor, Tensor]:
-    """Return `source_maximum` and which of all N * K * K logits it is, (B, 1, H, W)."""
-    taps = logits.shape[2]
-    largest, index = logits[:, 0].max(1, keepdim=True)
-    for n in range(1, logits.shape[1]):
-        value, place = logits[:, n].max(1, keepdim=True)
-        index = torch.where(value > largest, place + n * taps, index)
-        largest = torch.maximum(value, largest)
-    return largest[:, None], index
+def _largest(logits: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Return `source_maximum` and which of all N * K * K logits it is, (B, 1, H, W).
+
+    The largest of each row of taps first: finding places costs 40 times as much as finding values.
+    """
+    lines = logits.reshape(len(logits), -1, size, *logits.shape[3:])
+    largest, line = lines.amax(2).max(1, keepdim=True)
+    taps = torch.gather(lines, 1, line[:, :, None].expand(-1, -1, size, -1, -1))[:, 0]
+    return largest[:, None], line * size + taps.argmax(1, keepdim=True)
 
 
 def _gathered(image: Tensor, numbers: Tensor, size: int, source: Tensor | None = None) -> Tensor:
     image = wide(image)[:, None]
     numbers = numbers[:, None]
-    source = None if source is None else source[:, None]
+    # With a shift of 0 at every pixel that is reached, offsets that leave the image have no weight at all.
+    target = None if source is None else torch.zeros_like(image[:, 0, :1])
+    source = None if source is None else source[:, None].to(image.dtype)
     if exporting():
-        return graph.collect(image, graph.weights(numbers.to(image.dtype), size, source, None), size)[:, 0]
+        return graph.collect(image, graph.weights(numbers.to(image.dtype), size, source, target), size)[:, 0]
     _check(image, numbers, size)
     if torch.is_grad_enabled() and (image.requires_grad or numbers.requires_grad):
-        result: Tensor = _Gather.apply(image, numbers, source, size)
+        result: Tensor = _Gather.apply(image, numbers, source, target, size)
         return result[:, 0]
-    return collect(Kernels(numbers, size, image.dtype, source), image)[:, 0]
+    return collect(Kernels(numbers, size, image.dtype, source, target), image)[:, 0]
 
 
 def _check(values: Tensor, numbers: Tensor, size: int) -> None:
@@ -261,17 +264,19 @@ class _Gather(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, numbers: Tensor, source: Tensor | None, size: int) -> Tensor:
-        ctx.save_for_backward(image, numbers, source)
+    def forward(
+        ctx: Any, image: Tensor, numbers: Tensor, source: Tensor | None, target: Tensor | None, size: int
+    ) -> Tensor:
+        ctx.save_for_backward(image, numbers, source, target)
         ctx.size = size
-        return collect(Kernels(numbers, size, image.dtype, source), image)
+        return collect(Kernels(numbers, size, image.dtype, source, target), image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        image, numbers, source = ctx.saved_tensors
-        kernels = Kernels(numbers, ctx.size, image.dtype, source)
+        image, numbers, source, target = ctx.saved_tensors
+        kernels = Kernels(numbers, ctx.size, image.dtype, source, target)
         for_image, for_numbers = ctx.needs_input_grad[:2]
         d_image = scatter(kernels, gradient)[:, None, :-1] if for_image else None
         d_numbers = slopes(kernels, gradient, image, (False, for_numbers, False)).numbers
-        return d_image, d_numbers, None, None
+        return d_image, d_numbers, None, None, None
