@@ -97,6 +97,8 @@ class Augmentation:
             world means anything to a denoiser.
         drop_history: Probability with which accumulated `irradiance` is replaced by that of the frame alone,
             as at the start of a sequence and where a surface comes into view.
+        samples: Fewest and most samples per pixel of a batch, where they are kept apart; drawn anew for each
+            batch, and which ones for each patch. None: all of them.
     """
 
     rule: Rule = "wskp"
@@ -104,6 +106,7 @@ class Augmentation:
     seed: int = 0
     permute: bool = False
     drop_history: float = 0.0
+    samples: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.rule not in ("wskp", "dihedral", "none"):
@@ -112,6 +115,10 @@ class Augmentation:
             raise ValueError(f"exposure_stops is {self.exposure_stops}; expected 0 to 16")
         if not 0 <= self.drop_history <= 1:
             raise ValueError(f"drop_history is {self.drop_history}; expected a probability, 0 to 1")
+        if self.samples is not None and not 1 <= self.samples[0] <= self.samples[-1]:
+            raise ValueError(
+                f"sample_counts is {list(self.samples)}; expected two numbers, 1 <= fewest <= most"
+            )
 
     def change(self, epoch: int, sample: int) -> Change:
         """Return what is applied to the images of a sample in an epoch."""
@@ -131,6 +138,13 @@ class Augmentation:
         if self.rule == "none" or bits & 1:
             return Turn.NONE
         return (Turn.FLIP_X, Turn.FLIP_Y, LEFT, RIGHT)[(bits >> 1) & 3]
+
+    def sample_count(self, epoch: int, sample: int, held: int) -> int:
+        """Return how many of `held` samples per pixel a batch has whose first patch is `sample`."""
+        if self.samples is None:
+            return held
+        fewest, most = (min(number, held) for number in self.samples)
+        return fewest + (random_bits(self.seed, epoch, sample, 6) >> 8) % (most - fewest + 1)
 
     def exposure_factor(self, epoch: int, sample: int) -> float:
         """Return the factor that is applied to the sample's exposure."""

@@ -304,6 +304,10 @@ SAMPLE_BUFFERS: dict[str, SampleChannel] = {
 """What `Frame.samples` may hold. Channels are called `<name>.<letter>`, such as `radiance.R`."""
 
 
+SAMPLES = "samples"
+"""Name under which the samples of each pixel are stored, (S, C, H, W), and read by networks."""
+
+
 def sample_channels(*names: str) -> tuple[str, ...]:
     """Return the channels of per-sample quantities in order, such as `normal.X`, `normal.Y`, `normal.Z`.
 

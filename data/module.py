@@ -8,7 +8,7 @@ from typing import Any, Literal
 from lightning.pytorch import LightningDataModule
 
 from data.augment import Augmentation, Rule
-from data.buffers import buffer
+from data.buffers import SAMPLES, buffer
 from data.frames import FrameSet
 from data.manifest import load_manifest
 from data.needs import beside, explain_lacking, patch_number
@@ -17,7 +17,6 @@ from data.shards.batch import Batches, available
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
 from data.shards.options import recipe_options
-from data.shards.planes import SAMPLES
 from data.shards.prepare import cached_path, prepare_cached
 from data.shards.progress import LineProgress
 from data.shards.read import CorruptSampleError, Sample, ShardReader
@@ -65,11 +64,12 @@ class Shards(LightningDataModule):
             of the frame alone. The command line fills it in from the network.
         recipe: How the root is prepared here, `bmfr`, `afgsa` or `layers` (see `trainer prepare --help`);
             None: as WSKP, with whatever samples the frames keep apart.
+        sample_counts: Fewest and most samples per pixel that a training batch keeps, drawn anew for each
+            batch, where frames keep samples apart; None: all.
         spp: Use only frames with these samples per pixel, where the root is prepared here; None: all.
 
     Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W) and `sample_channels`,
-    a list of C names such as `radiance.R`. They are not augmented yet, so that needs `augment` off, or
-    `buffers` without `samples`.
+    a list of C names such as `radiance.R`. They turn with the image (`data.augment_samples`).
     """
 
     def __init__(
@@ -93,6 +93,7 @@ class Shards(LightningDataModule):
         recipe: Literal["bmfr", "afgsa", "layers"] | None = None,
         spp: Sequence[int] | None = None,
         targets: Sequence[str] = ("reference",),
+        sample_counts: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0:
@@ -102,9 +103,9 @@ class Shards(LightningDataModule):
         self.root = root
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
         self.augmentation = (
-            Augmentation(augment_rule, exposure_stops, seed, permute, drop_history)
+            Augmentation(augment_rule, exposure_stops, seed, permute, drop_history, sample_counts)
             if augment
-            else Augmentation("none", seed=seed)
+            else Augmentation("none", seed=seed, samples=sample_counts)
         )
         self.targets = tuple(dict.fromkeys(("reference", *targets)))
         explicit = {

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from data.buffers import SAMPLES
 from data.manifest import FrameRecord
 from data.root import SAMPLE
 from data.sample import CANDIDATES, TRAIN_PATCHES
 from data.shards.options import recipe_options
-from data.shards.planes import SAMPLES
 
 
 def beside(recipe: str | None, names: Sequence[str]) -> tuple[str, ...]:

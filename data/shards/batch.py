@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
+from data import augment_samples
 from data.augment import IMAGE_PLANE, UNCHANGED, Augmentation, Change, Turn, reordered, turn_vectors, turned
-from data.buffers import buffer
-from data.shards.planes import SAMPLES
+from data.buffers import SAMPLES, buffer
 from data.shards.read import CorruptSampleError, Sample, ShardReader
 
 Batch = dict[str, Any]
@@ -94,11 +94,6 @@ class Batches(Dataset[Packed]):
         self.names = tuple(dict.fromkeys(names))
         self.inputs = frozenset(inputs)
         self.augmentation, self.on_corrupt = augmentation, on_corrupt
-        if SAMPLES in self.names and _moves(augmentation):
-            raise ValueError(
-                "samples that are kept apart are not flipped, rotated or permuted yet: use --data.augment "
-                "false, or name the buffers that are read, without `samples`"
-            )
 
     def __len__(self) -> int:
         return len(self.reader)
@@ -122,7 +117,8 @@ class Batches(Dataset[Packed]):
         samples = [self.reader.sample(number) for number in numbers]
         if not samples:
             return _nothing(corrupt)
-        shapes = tuple((name, (len(samples), *_shape(samples, name))) for name in self.names)
+        kept = self._sample_count(order.epoch, numbers, samples) if SAMPLES in self.names else 0
+        shapes = tuple((name, (len(samples), *_shape(samples, name, kept))) for name in self.names)
         pixels = _allocate(sum(math.prod(shape) for _, shape in shapes))
         changes = [self._change(order.epoch, number) for number in numbers]
         start = 0
@@ -130,7 +126,10 @@ class Batches(Dataset[Packed]):
             size = math.prod(shape)
             target = pixels[start : start + size].view(shape)
             for row, number in enumerate(numbers):
-                self._fill(target[row], number, name, changes[row])
+                if name == SAMPLES:
+                    self._fill_samples(target[row], number, order.epoch, changes[row])
+                else:
+                    self._fill(target[row], number, name, changes[row])
             start += size
         return Packed(
             pixels,
@@ -185,6 +184,35 @@ class Batches(Dataset[Packed]):
         if name in IMAGE_PLANE:
             turn_vectors(target.numpy(), change.turn, name)
 
+    def _sample_count(self, epoch: int, numbers: list[int], samples: list[Sample]) -> int:
+        """Return how many samples per pixel all patches of a batch get."""
+        held = {sample.buffers[SAMPLES].shape[0] for sample in samples if SAMPLES in sample.buffers}
+        if not held:
+            raise ValueError(
+                f"sample {samples[0].key} has no samples of each pixel; prepare frames that keep them"
+            )
+        chosen = self.augmentation is not None and self.augmentation.samples is not None
+        if len({sample.sample_channels for sample in samples}) > 1 or (len(held) > 1 and not chosen):
+            listed = ", ".join(f"{s.key}: {_kept(s)}" for s in samples)
+            raise ValueError(
+                f"one batch with different samples per pixel ({listed}); expected the same number and "
+                "channels: use a batch size of 1, or for training a number that all have: "
+                "--data.sample_counts"
+            )
+        if self.augmentation is None:
+            return held.pop()
+        return self.augmentation.sample_count(epoch, numbers[0], min(held))
+
+    def _fill_samples(self, target: Tensor, number: int, epoch: int, change: Change) -> None:
+        source, channels = self.reader.array(number, SAMPLES), self.reader.sample(number).sample_channels
+        if self.augmentation is not None and self.augmentation.samples is not None:
+            seed = self.augmentation.seed
+            source = source[augment_samples.subset(len(source), len(target), seed, epoch, number)]
+        if change[:4] == UNCHANGED[:4]:
+            target.copy_(source)
+        else:
+            augment_samples.changed(source.to(torch.float32).numpy(), channels, change, target.numpy())
+
     def _source(self, number: int, name: str, alone: bool = False) -> Tensor:
         """Return a buffer (C, H, W) of a sample, stored or computed; `alone`: without history."""
         sample, reader = self.reader.sample(number), self.reader
@@ -219,23 +247,19 @@ def available(sample: Sample) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _moves(augmentation: Augmentation | None) -> bool:
-    return augmentation is not None and (augmentation.rule != "none" or augmentation.permute)
-
-
 def _nothing(corrupt: tuple[tuple[str, str], ...] = (), error: Exception | None = None) -> Packed:
     return Packed(torch.empty(0), (), (), (), corrupt, error)
 
 
-def _shape(samples: list[Sample], name: str) -> tuple[int, ...]:
+def _shape(samples: list[Sample], name: str, kept: int) -> tuple[int, ...]:
     if name != SAMPLES:
         return (buffer(name).channels, *_size(samples))
-    stored = samples[0].buffers.get(SAMPLES)
-    if stored is None:
-        raise ValueError(
-            f"sample {samples[0].key} has no samples of each pixel; prepare frames that keep them"
-        )
-    return (*stored.shape[:2], *_size(samples))
+    return (kept, len(samples[0].sample_channels), *_size(samples))
+
+
+def _kept(sample: Sample) -> str:
+    stored = sample.buffers.get(SAMPLES)
+    return "none" if stored is None else f"{stored.shape[0]} of {len(sample.sample_channels)} channels"
 
 
 def _size(samples: list[Sample]) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from data.buffers import SAMPLES
 from data.exr import StoredFrame
 from data.frames import FrameSet
 from data.importance import importance_candidates, importance_map
@@ -23,7 +24,7 @@ from data.patches import Position
 from data.shards.division import Candidate, Place, ShardPlan
 from data.shards.index import write_json
 from data.shards.options import PrepareOptions
-from data.shards.planes import SAMPLES, Planes
+from data.shards.planes import Planes
 from data.shards.write import ShardWriter
 from data.temporal import Accumulator
 

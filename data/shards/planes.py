@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import SAMPLE_BUFFERS, buffer
+from data.buffers import SAMPLE_BUFFERS, SAMPLES, buffer
 from data.frame import Image, Samples
 from data.patches import Position
 from data.repair import all_finite
@@ -22,9 +22,6 @@ HALF_FLOOR = 2.0**-8
 its 11 bits for values 1/64 of the largest and smaller."""
 
 _FLOOR = int(np.float16(HALF_FLOOR).view(np.uint16))
-
-SAMPLES = "samples"
-"""Name under which the samples of each pixel are stored, (S, C, H, W)."""
 
 Stored = NDArray[Any]
 """float16 or float32, little-endian, channels before rows and columns."""

@@ -358,8 +358,6 @@ def test_samples_are_delivered_to_a_network_that_reads_them(tmp_path: Path):
     batch = next(iter(data.train_dataloader()))
     assert batch["samples"].shape == (2, 4, len(CHANNELS), 16, 16)
     assert batch["sample_channels"] == list(CHANNELS)
-    with pytest.raises(ValueError, match="not flipped, rotated or permuted yet"):
-        Shards(str(index.root), 2, 0, buffers=("samples",)).train_dataloader()
     assert "samples" not in next(iter(Shards(str(index.root), 2, 0, buffers=("color",)).train_dataloader()))
 
 
@@ -385,3 +383,17 @@ def test_a_root_is_prepared_here_by_recipe_and_samples_per_pixel(tmp_path: Path)
     assert (options.recipe, options.train_patches, options.accumulate) == ("afgsa", 80, False)
     assert Shards(str(root)).options == PrepareOptions()
     assert Shards("sample:bmfr", recipe="layers").options.train_patches == 56
+
+
+def test_training_batches_keep_a_random_number_of_samples_and_evaluation_all(tmp_path: Path):
+    index = stills(tmp_path)
+    data = Shards(str(index.root), 2, 0, buffers=("samples",), sample_counts=(2, 8))
+    found = {len(batch["samples"][0]) for batch in data.train_dataloader()}
+    assert found <= {2, 3, 4}
+    assert len(found) > 1
+    assert next(iter(data.val_dataloader()))["samples"].shape[1] == 4
+
+
+def test_sample_counts_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match=r"sample_counts is \[4, 2\]; expected two numbers"):
+        Shards(sample_counts=(4, 2))

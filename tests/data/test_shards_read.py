@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from data.augment import Augmentation, Turn, turned
+from data.augment import Augmentation, Turn, reordered, turned
+from data.augment_samples import changed
 from data.frames import FrameSet
 from data.shards.batch import Batches, Order
 from data.shards.index import INDEX, Index
@@ -265,12 +266,49 @@ def test_batches_without_samples_name_no_channels(sampled: Index):
     assert "sample_channels" not in batch
 
 
-@pytest.mark.parametrize("augmentation", [Augmentation("wskp"), Augmentation("none", permute=True)])
-def test_samples_are_not_augmented_but_refused(sampled: Index, augmentation: Augmentation):
+@pytest.mark.parametrize(
+    "augmentation", [Augmentation("dihedral", seed=3), Augmentation("none", permute=True)]
+)
+def test_samples_change_as_their_reference_does(sampled: Index, augmentation: Augmentation):
     reader = ShardReader(sampled, "train")
-    with pytest.raises(ValueError, match=r"not flipped, rotated or permuted yet.*--data\.augment false"):
-        Batches(reader, ("samples",), False, augmentation=augmentation)
-    Batches(reader, ("color",), False, augmentation=augmentation)
-    exposed = Batches(reader, ("samples",), False, augmentation=Augmentation("none", exposure_stops=2))
-    plain = Batches(reader, ("samples",), False)
-    assert torch.equal(exposed[Order(1, (0,))].pixels, plain[Order(1, (0,))].pixels)
+    plain = Batches(reader, ("samples", "reference"), False)
+    changing = Batches(reader, ("samples", "reference"), False, augmentation=augmentation)
+    seen = set()
+    for number in range(len(reader)):
+        change = augmentation.change(1, number)
+        before, after = (batches[Order(1, (number,))].unpack() for batches in (plain, changing))
+        expected = np.empty_like(before["samples"][0].numpy())
+        changed(before["samples"][0].numpy(), CHANNELS, change, expected)
+        assert np.array_equal(after["samples"][0], expected)
+        image = turned(reordered(before["reference"][0].numpy(), "reference", change), change.turn)
+        assert np.array_equal(after["reference"][0], image)
+        seen.add(change[:4])
+    assert len(seen) > 1
+
+
+def test_a_subset_of_the_samples_is_kept_the_same_number_for_a_whole_batch(sampled: Index):
+    reader = ShardReader(sampled, "train")
+    batches = Batches(reader, ("samples",), False, augmentation=Augmentation("none", samples=(1, 3)))
+    counts = set()
+    for first in range(len(reader) - 1):
+        found = batches[Order(2, (first, first + 1))].unpack()["samples"]
+        counts.add(found.shape[1])
+        for row, number in enumerate((first, first + 1)):
+            held = [sample.tobytes() for sample in reader.array(number, "samples").float().numpy()]
+            kept = [held.index(sample.numpy().tobytes()) for sample in found[row]]
+            assert len(set(kept)) == found.shape[1]
+    assert counts == {1, 2, 3}
+
+
+def test_different_sample_counts_in_one_batch_are_named_unless_all_have_enough(sampled: Index):
+    reader = ShardReader(sampled, "train")
+    reader.sample(1)
+    stored = reader._samples[1].buffers["samples"]
+    fewer = stored._replace(shape=(2, *stored.shape[1:]))
+    reader._samples[1] = reader.sample(1)._replace(buffers={**reader.sample(1).buffers, "samples": fewer})
+    with pytest.raises(
+        ValueError, match=r"different samples per pixel \(.*: 4 of .*: 2 of .*--data.sample_counts"
+    ):
+        Batches(reader, ("samples",), False)[Order(0, (0, 1))]
+    some = Batches(reader, ("samples",), False, augmentation=Augmentation("none", samples=(1, 8)))
+    assert some[Order(0, (0, 1))].unpack()["samples"].shape[1] <= 2
