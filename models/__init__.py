@@ -13,6 +13,7 @@ from models.classical.nlm import NLM, JointNLM, MultiScaleNLM
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN
+from models.layers import Layer, Optimized, PixelGather, SampleSplat
 from models.wskp import WSKP
 
 __all__ = [
@@ -25,5 +26,9 @@ __all__ = [
     "CrossBilateral",
     "JointBilateral",
     "JointNLM",
+    "Layer",
     "MultiScaleNLM",
+    "Optimized",
+    "PixelGather",
+    "SampleSplat",
 ]

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from data.buffers import FRAME_NUMBERS, buffer
+from data.buffers import FRAME_NUMBERS, SAMPLES, buffer, sample_channels
+from models.ops.per_sample import arranged
 
 Buffers = Mapping[str, Tensor]
 
@@ -53,9 +54,14 @@ class Denoiser(nn.Module):
         halo: Pixels on each side of a core that the core depends on; cores are rectangles whose sides lie at
             multiples of `multiple`, single pixels where that is 1.
         multiple: Side of the method's own grid. Tiles start at multiples of it; images of other sizes are
-            padded by repeating their last row and column, in the module and in the tiler alike.
+            padded by repeating their last row and column, `samples` by pixels without samples (NaN), in the
+            module and in the tiler alike.
         temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
-        per_sample: Buffers carry a sample axis (B, S, C, H, W).
+        per_sample: It reads `samples` (B, S, C, H, W), of any number of samples per pixel. Samples with a
+            channel that is not finite do not count, pixels without any are filled from around them.
+        samples: Quantities in `samples`, in this order (`data.buffers.sample_channels` lists the channels);
+            `select` brings a batch into it.
+        fill: Quantity → the constant that stands for it where a batch's samples lack it.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         targets: Names of the buffers that training compares with.
@@ -68,6 +74,8 @@ class Denoiser(nn.Module):
     multiple: int = 1
     temporal: bool = False
     per_sample: bool = False
+    samples: tuple[str, ...] = ()
+    fill: Mapping[str, float] = {}
     bytes_per_pixel: int = 500
     bytes_once: int = 0
     targets: tuple[str, ...] = ("reference",)
@@ -77,7 +85,8 @@ class Denoiser(nn.Module):
         """Denoise a batch of images.
 
         Args:
-            buffers: Tensors (B, C, H, W) for each name of `inputs`, and optionally frame numbers.
+            buffers: Tensors (B, C, H, W) for each name of `inputs`, `samples` (B, S, C, H, W), and optionally
+                frame numbers.
 
         Raises:
             ValueError: A buffer is missing or has another shape (see `check`).
@@ -131,14 +140,25 @@ class Denoiser(nn.Module):
             # Sizes are symbols there: comparing them would tie the graph to the example's.
             return batch, height, width
         for name in self.inputs:
-            tensor, channels = buffers[name], buffer(name).channels
-            expected = (batch, channels, height, width)
+            tensor, expected = buffers[name], (batch, *self._leading(buffers, name), height, width)
             if tuple(tensor.shape) != expected:
                 raise ValueError(
                     f"{type(self).__name__}: buffer {name!r} has shape {tuple(tensor.shape)}, "
                     f"expected {expected} like {self.inputs[0]!r}"
                 )
         return batch, height, width
+
+    def _leading(self, buffers: Buffers, name: str) -> tuple[int, ...]:
+        """Return the sizes expected between batch and rows: channels, of `samples` also their number."""
+        if name != SAMPLES:
+            return (buffer(name).channels,)
+        channels, shape = sample_channels(*self.samples), buffers[name].shape
+        if len(shape) != 5 or shape[1] == 0 or shape[2] != len(channels):
+            raise ValueError(
+                f"{type(self).__name__}: buffer 'samples' has shape {tuple(shape)}, expected (B, S, "
+                f"{len(channels)}, H, W) with at least one sample and the channels {', '.join(channels)}"
+            )
+        return (shape[1], len(channels))
 
     def exposure(self, buffers: Buffers) -> Tensor:
         """Return the exposure as (B, 1, 1, 1), 1 where the mapping has none or one that is not positive."""
@@ -151,6 +171,17 @@ class Denoiser(nn.Module):
 
 
 def select(denoiser: Denoiser, buffers: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the part of a batch that a denoiser reads: its inputs and the known frame numbers."""
+    """Return the part of a batch that a denoiser reads: its inputs and the known frame numbers.
+
+    Where `sample_channels` says what the channels of `samples` are, they are brought into the denoiser's
+    order, with constants for what is missing and in its `fill`.
+
+    Raises:
+        ValueError: The samples lack a quantity that has no constant; names it.
+    """
     names = (*denoiser.inputs, *(n for n in FRAME_NUMBERS if n in denoiser.frame_numbers))
-    return {name: buffers[name] for name in names if name in buffers}
+    chosen = {name: buffers[name] for name in names if name in buffers}
+    channels = buffers.get("sample_channels")
+    if SAMPLES in chosen and channels is not None:
+        chosen[SAMPLES] = arranged(chosen[SAMPLES], channels, denoiser.samples, denoiser.fill)
+    return chosen

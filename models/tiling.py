@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from data.buffers import FRAME_NUMBERS
+from data.buffers import FRAME_NUMBERS, SAMPLES
 
 BYTES_PER_PIXEL = 500
 """Working memory per pixel where a method does not declare `bytes_per_pixel`: ONNX Runtime was measured to
@@ -141,8 +141,9 @@ def denoise_tiled(
 
     Args:
         denoiser: A `models.Denoiser`, or an object with the attributes of `Tileable`. Not recurrent.
-        buffers: Tensors (B, C, H, W) for each of its inputs, optionally frame numbers (`exposure` …); numbers
-            that `measure` gives and the mapping lacks are measured on these images.
+        buffers: Tensors (B, C, H, W) for each of its inputs, `samples` (B, S, C, H, W), optionally frame
+            numbers (`exposure` …); numbers that `measure` gives and the mapping lacks are measured on these
+            images.
         tile: Largest side of a core in pixels, at least the method's multiple; None: from `budget`.
         budget: Working memory of the method in bytes.
 
@@ -155,7 +156,7 @@ def denoise_tiled(
     batch, height, width = _size(denoiser, buffers)
     numbers = numbers_of_frame(denoiser, buffers)
     multiple = denoiser.multiple
-    images = {name: _padded(buffers[name], multiple) for name in denoiser.inputs}
+    images = {name: _padded(name, buffers[name], multiple) for name in denoiser.inputs}
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
     result: Tensor | None = None
     if tile is None:
@@ -212,10 +213,12 @@ def _even(size: int, largest: int, multiple: int) -> int:
     return _round_up(-(-size // pieces), multiple)
 
 
-def _padded(image: Tensor, multiple: int) -> Tensor:
+def _padded(name: str, image: Tensor, multiple: int) -> Tensor:
     bottom, right = -image.shape[-2] % multiple, -image.shape[-1] % multiple
     if not bottom and not right:
         return image
+    if name == SAMPLES:  # pixels without samples, so that nothing from beyond the image is splatted into it
+        return F.pad(image, (0, right, 0, bottom), value=torch.nan)
     return F.pad(image, (0, right, 0, bottom), mode="replicate")
 
 

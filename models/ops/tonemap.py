@@ -17,6 +17,9 @@ LARGEST = 1e12
 """Bound of exposed radiance, before log and after exp: far above any firefly, and products of it, such as
 squares, stay far below overflow."""
 
+_SRGB_LINEAR = 0.0031308
+"""Up to this the sRGB curve is a line."""
+
 _DARKEST = 1e-12
 """Below this the curve continues linearly: the slope of x**0.45 grows without bound at 0."""
 
@@ -36,6 +39,20 @@ def gamma(radiance: Tensor) -> Tensor:
     dark = bounded < _DARKEST
     curve = bounded.clamp_min(_DARKEST).pow(GAMMA)
     return torch.where(dark, bounded * (_DARKEST ** (GAMMA - 1.0)), curve)
+
+
+def srgb_log(radiance: Tensor) -> Tensor:
+    """Return sRGB(log(1 + x)) of radiance x clipped to [1e-5, 65536], in float32 or wider: [1.3e-4, 2.7].
+
+    Args:
+        radiance: Exposed linear radiance of any shape.
+
+    Source: equations 7 and 8 of Munkberg and Hasselgren 2020 (doi:10.1111/cgf.14049); the bounds are those
+    of the authors' code.
+    """
+    value = torch.log1p(wide(radiance).clamp(1e-5, 65536.0))
+    curve = 1.055 * value.clamp_min(_SRGB_LINEAR).pow(1 / 2.4) - 0.055
+    return torch.where(value > _SRGB_LINEAR, curve, 12.92 * value)
 
 
 def exposed(radiance: Tensor, exposure: Tensor) -> Tensor:

@@ -10,20 +10,23 @@ import torch
 from torch import Tensor, nn
 
 import models
-from data.buffers import BUFFERS, FRAME_NUMBERS, buffer
+from data.buffers import BUFFERS, FRAME_NUMBERS, SAMPLE_BUFFERS, SAMPLES, buffer
 from models.denoiser import Denoiser, select
 from models.tiling import denoise_tiled
-from tests.models.frames import largest_relative, lit, luminous, split_buffers
+from tests.models.frames import largest_relative, lit, luminous, sampled, split_buffers
 
-KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral"}
+LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
+"""Methods on samples that are kept apart."""
+
+KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral", *LAYERS}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
-CLEANING = {"ACFM", "AFGSA", "KPCN"}
+CLEANING = {"ACFM", "AFGSA", "KPCN", *LAYERS}
 """Methods that take radiance which is negative, infinite or not a number; the data module repairs it for the
 others."""
 
-DECIDE = {"NFOR", "JointNLM"}
-"""Methods that choose, between candidates or by a minimum: gradients reach less far than values."""
+DECIDE = {"NFOR", "JointNLM", *LAYERS}
+"""Methods that choose, between candidates or by an extremum: gradients reach less far than values."""
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "AFGSA": {"width": 16, "blocks": 2, "heads": 2},
@@ -33,6 +36,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "NLM": {"window": 2, "patch": 1},
     "JointNLM": {"window": 2, "patch": 1, "prefilter_window": 1},
     "MultiScaleNLM": {"window": 2, "patch": 1},
+    **{key: {"width": 4, "levels": 3, "kernel_size": 5, "embedding": 8} for key in LAYERS},
 }
 """Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""
 
@@ -63,7 +67,24 @@ def inputs(
 def everything(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
     """Random buffers and frame numbers for any method."""
     numbers = {"exposure": torch.ones(batch), "depth_range": torch.tensor([[1.0, 6.0]]).repeat(batch, 1)}
-    return {**split_buffers(batch, height, width, seed), **numbers}
+    return {**sampled(split_buffers(batch, height, width, seed)), **numbers}
+
+
+def relit(whole: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The buffers with light, and samples, as irradiance and albedo make them."""
+    return sampled(lit(whole))
+
+
+def kind(name: str) -> str:
+    """What a buffer holds: samples count as the radiance among them."""
+    return "radiance" if name == SAMPLES else buffer(name).kind
+
+
+def scaled_radiance(name: str, image: Tensor, factor: float) -> Tensor:
+    """A buffer of radiance, or its variance, in other units."""
+    if name == SAMPLES:
+        return torch.cat([image[:, :, :3] * factor, image[:, :, 3:]], 2)
+    return image * factor ** {"radiance": 1, "variance": 2}[kind(name)]
 
 
 def test_the_catalogue_lists_exactly_the_denoisers() -> None:
@@ -77,7 +98,9 @@ def test_the_catalogue_lists_exactly_the_denoisers() -> None:
 
 def test_declarations_are_in_the_vocabulary(denoiser: Denoiser) -> None:
     assert denoiser.inputs
-    assert set(denoiser.inputs) <= set(BUFFERS)
+    assert set(denoiser.inputs) <= {*BUFFERS, SAMPLES}
+    assert (SAMPLES in denoiser.inputs) == denoiser.per_sample == bool(denoiser.samples)
+    assert set(denoiser.samples) <= set(SAMPLE_BUFFERS)
     assert set(denoiser.frame_numbers) <= set(FRAME_NUMBERS)
     assert denoiser.halo >= 0
     assert denoiser.multiple >= 1
@@ -104,36 +127,36 @@ def test_constant_irradiance_stays_constant_borders_included(
     whole = everything(1, 33, 29)
     if "irradiance" not in denoiser.inputs:  # then what is filtered is divided by a slightly larger albedo
         whole["albedo"] = torch.full_like(whole["albedo"], 0.5)
-    buffers = select(denoiser, lit(luminous(whole, value)))
+    constant = relit(luminous(whole, value))
     with torch.no_grad():
-        found = denoiser(buffers).color / buffers["albedo"]
+        found = denoiser(select(denoiser, constant)).color / constant["albedo"]
     torch.testing.assert_close(found, torch.full_like(found, value), rtol=1e-5, atol=0)
 
 
-def extreme(kind: str, denoiser: Denoiser, seed: int = 0) -> dict[str, Tensor]:
+def extreme(case: str, denoiser: Denoiser, seed: int = 0) -> dict[str, Tensor]:
     whole = everything(1, 32, 40, seed)
     noisy = whole["irradiance"].clone()
-    if kind == "black":
+    if case == "black":
         black = {key: torch.zeros_like(value) for key, value in whole.items() if key not in FRAME_NUMBERS}
         return select(denoiser, black)
-    if kind == "bright":
+    if case == "bright":
         noisy = torch.full_like(noisy, 65504.0)
-    if kind == "fireflies":
+    if case == "fireflies":
         noisy[..., ::7, ::5] = 65504.0
-    if kind == "one firefly in black":
+    if case == "one firefly in black":
         noisy = torch.zeros_like(noisy)
         noisy[..., 9, 11] = 1e9
-    if kind == "no normals and no depth":
+    if case == "no normals and no depth":
         whole |= {name: torch.zeros_like(whole[name]) for name in ("normal", "depth")}
         whole["depth_range"] = torch.zeros_like(whole["depth_range"])
-    return select(denoiser, lit({**whole, "irradiance": noisy}))
+    return select(denoiser, relit({**whole, "irradiance": noisy}))
 
 
 def damaged(denoiser: Denoiser) -> dict[str, Tensor]:
     """Inputs with radiance that no renderer should write: not a number, infinite, negative."""
     buffers = inputs(denoiser)
     for key in denoiser.inputs:
-        if buffer(key.removesuffix("_variance")).kind == "radiance":
+        if kind(key.removesuffix("_variance")) == "radiance":
             image = buffers[key] = buffers[key].clone()
             image[..., 3, 4], image[..., 5, 30], image[..., 20:23, 7] = torch.nan, torch.inf, -0.5
     return buffers
@@ -141,7 +164,7 @@ def damaged(denoiser: Denoiser) -> dict[str, Tensor]:
 
 def radiance(denoiser: Denoiser) -> str:
     """Return the name of a buffer that a method filters."""
-    return next(name for name in denoiser.inputs if buffer(name).kind == "radiance")
+    return next(name for name in denoiser.inputs if kind(name) == "radiance")
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -257,7 +280,7 @@ def test_the_halo_is_the_reach_no_more_and_no_less(denoiser: Denoiser, name: str
     reached = torch.zeros(size, size, dtype=torch.bool)
     for gradient in gradients:
         if gradient is not None:
-            reached |= (gradient[0].abs() > 0).any(0)
+            reached |= (gradient[0].abs() > 0).flatten(0, -3).any(0)
     rows, columns = reached.nonzero().unbind(1)
     for axis in (rows, columns):
         reach = (before - int(axis.min()), int(axis.max()) - (before + side - 1))
@@ -283,11 +306,12 @@ def test_a_missing_buffer_is_named(denoiser: Denoiser) -> None:
 
 def test_a_buffer_of_another_shape_is_named(denoiser: Denoiser) -> None:
     last = denoiser.inputs[-1]
+    inner = tuple(inputs(denoiser)[last].shape[1:-2])  # channels; samples and channels
     wrong: dict[str, Any] = {
-        "size": torch.rand(1, buffer(last).channels, 32, 41),
-        "channels": torch.rand(1, buffer(last).channels + 1, 32, 40),
-        "batch": torch.rand(2, buffer(last).channels, 32, 40),
-        "rank": torch.rand(buffer(last).channels, 32, 40),
+        "size": torch.rand(1, *inner, 32, 41),
+        "channels": torch.rand(1, *inner[:-1], inner[-1] + 1, 32, 40),
+        "batch": torch.rand(2, *inner, 32, 40),
+        "rank": torch.rand(*inner, 32, 40),
     }
     if len(denoiser.inputs) == 1:  # then it sets size and batch itself
         del wrong["size"], wrong["batch"]
@@ -298,9 +322,8 @@ def test_a_buffer_of_another_shape_is_named(denoiser: Denoiser) -> None:
 
 def test_radiance_in_other_units_comes_back_in_those_units(denoiser: Denoiser) -> None:
     buffers = inputs(denoiser)
-    powers = {"radiance": 1, "variance": 2}
-    names = [n for n in denoiser.inputs if buffer(n.removesuffix("_variance")).kind == "radiance"]
-    scaled = {**buffers, **{n: buffers[n] * 50 ** powers[buffer(n).kind] for n in names}}
+    names = [n for n in denoiser.inputs if kind(n.removesuffix("_variance")) == "radiance"]
+    scaled = {**buffers, **{n: scaled_radiance(n, buffers[n], 50) for n in names}}
     if "exposure" in denoiser.frame_numbers:
         scaled["exposure"] = torch.tensor([1 / 50])
     with torch.no_grad():

@@ -46,6 +46,29 @@ def lit(buffers: dict[str, Tensor]) -> dict[str, Tensor]:
     return {**buffers, "color": color, "diffuse": 0.75 * color, "specular": 0.25 * color, **halves}
 
 
+def random_samples(batch: int, spp: int, height: int, width: int, seed: int = 0) -> Tensor:
+    """Return samples (B, S, 20, H, W) of a random surface, as the networks of `models.layers` read them."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(channels: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+        unit = torch.rand(batch, spp, channels, height, width, generator=generator)
+        return low + (high - low) * unit
+
+    radiance = -2.0 * torch.log1p(-noise(3)) * noise(3)
+    normal = torch.nn.functional.normalize(noise(3) - 0.5, dim=2)
+    blur = [noise(2, -8, 8), noise(1, -3, 6), noise(2, -1, 1), noise(1)]
+    return torch.cat([radiance, normal, noise(1, 2, 5), noise(3), noise(3), noise(1), *blur], 2)
+
+
+def sampled(buffers: dict[str, Tensor], spp: int = 3) -> dict[str, Tensor]:
+    """Return the buffers with samples (B, S, 20, H, W) that have their radiance, normal, depth, albedo."""
+    color = buffers["color"]
+    made = random_samples(len(color), spp, *color.shape[2:])
+    guides = torch.cat([buffers[name] for name in ("color", "normal", "depth", "albedo")], 1)
+    made[:, :, :10] = guides[:, None]
+    return {**buffers, "samples": made}
+
+
 def luminous(buffers: dict[str, Tensor], value: float) -> dict[str, Tensor]:
     """Return the buffers with constant irradiance."""
     return {**buffers, "irradiance": torch.full_like(buffers["irradiance"], value)}

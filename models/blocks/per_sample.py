@@ -1,0 +1,160 @@
+"""What the networks of Munkberg and Hasselgren 2020 (`models.layers`) share: what they see, and the U-Net."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from data.buffers import SAMPLE_BUFFERS, SAMPLES, sample_channels
+from models.blocks.unet import UNet, Upsampling
+from models.denoiser import Buffers, Denoiser
+from models.ops.boxes import exporting
+from models.ops.guides import depth_range, farthest, finite
+from models.ops.per_sample import whole
+from models.ops.tonemap import exposed, srgb_log
+
+RADIANCE_LIMIT = 65535.0
+"""Exposed radiance is clipped to this, as in the authors' code."""
+
+FEATURE_LIMIT = 1000.0
+"""What networks see is clipped to +- this."""
+
+_READ = (
+    "radiance",
+    "normal",
+    "depth",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "motion",
+    "coc",
+    "lens",
+    "time",
+)
+_SCALES = {"motion": 1 / 128, "coc": 1 / 2}
+"""Pixels to the authors' numbers: device coordinates of a frame of 256 pixels, and a radius."""
+
+
+class Seen(NamedTuple):
+    """Samples as networks see them; those that do not count are 0.
+
+    Attributes:
+        radiance: Exposed linear radiance (B, S, 3, H, W).
+        features: What the sample reducer reads, (B, S, 20, H, W).
+        counts: 1 where a sample counts, otherwise 0, (B, S, 1, H, W).
+    """
+
+    radiance: Tensor
+    features: Tensor
+    counts: Tensor
+
+
+class Frame(NamedTuple):
+    """A batch, padded to the grid of the U-Net: samples, exposure and largest depth (B, 1, 1, 1)."""
+
+    samples: Tensor
+    exposure: Tensor
+    farthest: Tensor
+
+
+class PerSample(Denoiser):
+    """What the networks of the paper share.
+
+    Attributes:
+        order: In which the sample reducer reads the quantities.
+
+    Args:
+        kernel_size: Rows and columns of the kernels, odd.
+        width: Channels of the U-Net at full resolution; all its widths and those of the kernel generator
+            follow from it.
+        levels: How often the U-Net halves the resolution.
+        embedding: Channels of an embedding.
+        upsampling: In the U-Net: `nearest` (authors' code) or `bilinear` (paper).
+        recompute: In training, compute what belongs to single samples again in the backward pass.
+        fill: Quantity → the constant that stands for it where samples lack it, such as `{"lens": 0}`.
+
+    Raises:
+        ValueError: An argument is out of range; the message names it.
+    """
+
+    inputs = (SAMPLES,)
+    frame_numbers = ("exposure", "depth_range")
+    per_sample = True
+    samples = _READ  # as files and shards hold them, so that batches need not be copied
+    bytes_per_pixel = 4000
+    order = _READ
+
+    def __init__(
+        self,
+        kernel_size: int,
+        width: int,
+        levels: int,
+        embedding: int,
+        upsampling: Upsampling,
+        recompute: bool,
+        fill: Mapping[str, float] | None,
+    ) -> None:
+        super().__init__()
+        if kernel_size < 3 or kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size must be odd and at least 3, got {kernel_size}")
+        if width < 2 or width % 2 or embedding < 1 or not 1 <= levels <= 5:
+            raise ValueError(
+                f"width {width}, embedding {embedding}, levels {levels}: expected an even width from 2, an "
+                "embedding from 1 and 1 to 5 levels"
+            )
+        for name in fill or {}:
+            if name not in _READ or name == "radiance":
+                raise ValueError(f"fill: {name!r} is no guide that is read; those are {', '.join(_READ[1:])}")
+        self.kernel_size, self.width, self.embedding = kernel_size, width, embedding
+        self.recompute, self.fill = recompute, dict(fill or {})
+        self.multiple = 2**levels
+        self.context = 2 * width
+        self.unet = self._unet(levels, upsampling)
+
+    def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
+        w = self.width
+        encoder, decoder = (2 * w, 4 * w, 8 * w, 8 * w), (8 * w, 4 * w, 2 * w, 2 * w, 2 * w)
+        return UNet(self.embedding, w, encoder[: levels - 1], decoder[-levels:], self.context, upsampling)
+
+    def measure(self, buffers: Buffers) -> dict[str, Tensor]:
+        """Return `depth_range` (B, 2): smallest and largest depth of the samples of whole frames."""
+        place = sample_channels(*_READ).index("depth.Z")
+        return {"depth_range": depth_range(buffers[SAMPLES][:, :, place])}
+
+    def _frame(self, buffers: Buffers) -> Frame:
+        _, height, width = self.check(buffers)
+        samples = buffers[SAMPLES]
+        bottom, right = -height % self.multiple, -width % self.multiple
+        if exporting() or bottom or right:  # no number: pixels without samples
+            samples = F.pad(samples, (0, right, 0, bottom), value=torch.nan)
+        depths = buffers["depth_range"] if "depth_range" in buffers else self.measure(buffers)["depth_range"]
+        return Frame(samples, self.exposure(buffers), farthest(samples[:, 0, :1], depths))
+
+    def _seen(self, samples: Tensor, frame: Frame) -> Seen:
+        """Return some rows of a frame's samples as networks see them."""
+        counts = whole(samples)
+        clean = finite(samples.where(counts, 0.0))
+        parts: dict[str, Tensor] = {}
+        for name, part in zip(
+            _READ, clean.split([len(SAMPLE_BUFFERS[n].letters) for n in _READ], 2), strict=True
+        ):
+            parts[name] = part * _SCALES[name] if name in _SCALES else part
+        radiance = exposed(parts["radiance"], frame.exposure[:, None]).clamp_max(RADIANCE_LIMIT)
+        parts["radiance"] = srgb_log(radiance)
+        parts["depth"] = parts["depth"] / frame.farthest[:, None]
+        features = torch.cat([parts[name] for name in self.order], 2).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
+        weight = counts.to(radiance.dtype)
+        return Seen(radiance * weight, features * weight, weight)
+
+    def _images(self, frame: Frame) -> int:
+        return frame.samples.shape[0] * frame.samples.shape[1]
+
+    def _cropped(self, image: Tensor, buffers: Buffers) -> Tensor:
+        """Return images (B, …, H, W) of exposed radiance without padding, in the units of the input."""
+        height, width = buffers[SAMPLES].shape[-2:]
+        exposure = self.exposure(buffers)
+        return image[..., :height, :width] / (exposure if image.ndim == 4 else exposure[:, None])

@@ -1,0 +1,64 @@
+"""Fully connected networks that run at every pixel: chains of 1x1 convolutions."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+SLOPE = 0.01
+"""Negative slope of the leaky ReLU of Munkberg and Hasselgren 2020."""
+
+
+class Pointwise(nn.Module):
+    """1x1 convolutions with leaky ReLU (slope 0.01) between; Xavier uniform weights, zero biases.
+
+    Args:
+        widths: Channels of the input, between convolutions, and of the output.
+        linear: The last convolution has no activation.
+    """
+
+    def __init__(self, *widths: int, linear: bool) -> None:
+        super().__init__()
+        self.linear = linear
+        self.first = convolution(widths[0], widths[1], 1)
+        self.others = nn.ModuleList(
+            convolution(widths[i], widths[i + 1], 1) for i in range(1, len(widths) - 1)
+        )
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return (N, widths[-1], H, W) of (N, widths[0], H, W)."""
+        return self._rest(self.first(maps))
+
+    def joint(self, own: Tensor, shared: Tensor) -> Tensor:
+        """Return what comes of [own, shared] without joining them.
+
+        The first convolution is linear in both: what it makes of `shared` is computed once for all N.
+
+        Args:
+            own: (B, N, C1, H, W), of N samples or layers.
+            shared: (B, C2, H, W).
+
+        Returns:
+            (B, N, widths[-1], H, W).
+        """
+        batch, _, split, height, width = own.shape
+        weight = self.first.weight
+        common = F.conv2d(shared, weight[:, split:], self.first.bias)
+        maps = F.conv2d(own.reshape(-1, split, height, width), weight[:, :split])
+        maps = maps.reshape(batch, -1, *common.shape[1:]) + common[:, None]
+        maps = self._rest(maps.flatten(0, 1))
+        return maps.reshape(batch, -1, *maps.shape[1:])
+
+    def _rest(self, maps: Tensor) -> Tensor:
+        for layer in self.others:
+            maps = layer(F.leaky_relu(maps, SLOPE))
+        return maps if self.linear else F.leaky_relu(maps, SLOPE)
+
+
+def convolution(before: int, after: int, size: int) -> nn.Conv2d:
+    """Return a convolution padded with zeros to the same size; Xavier uniform weights, zero bias."""
+    made = nn.Conv2d(before, after, size, padding=size // 2)
+    nn.init.xavier_uniform_(made.weight)
+    assert made.bias is not None
+    nn.init.zeros_(made.bias)
+    return made

@@ -1,0 +1,484 @@
+"""Layer embeddings: samples sorted into a few layers, which are filtered and composited.
+
+Jacob Munkberg, Jon Hasselgren: "Neural Denoising with Layer Embeddings", Computer Graphics Forum 39(4), 2020,
+doi:10.1111/cgf.14049.
+
+A small network makes an embedding of every sample (20 numbers), a U-Net makes context of their mean in each
+pixel. From there the paper compares:
+
+    Layer        a share w_sl of every sample s goes to layer l (a softmax over layers, divided by the number
+                 of samples); kernels from [sum_s w_sl E_s, context] splat each layer
+    SampleSplat  kernels from [E_s, context] splat every sample
+    PixelGather  the embedding is that of mean and variance of the samples, one kernel gathers mean radiance
+    Optimized    Layer with 5x5 kernels on three levels in place of 17x17 ones
+
+A layer holds radiance L, weight w, embedding and occupancy n_l = sum of w_k for k >= l: a sample in a layer
+punches a hole into those in front of it. Radiance, weight and occupancy are splatted with the same kernel K:
+
+    rad_l = (L_l K_l) / (n_l K_l + 1e-6),   alpha_l = (w_l K_l) / (n_l K_l + 1e-6),
+    color = sum_l rad_l prod_{k < l} (1 - alpha_k)
+
+Weights are exp(logit - largest logit of the pixel that splats, over layers or samples and taps); what leaves
+the image is dropped. Where paper and the authors' code disagree:
+- upsampling in the U-Net is nearest, as in the code; `upsampling="bilinear"` is the paper's;
+- occupancy counts the layer itself and those behind it, as in code and pseudocode; equation 2 has those in
+  front;
+- `compositing="weighted"` (section 3.1) is not in the code. Read as sum_l L_l K_l / (sum_l w_l K_l + 1e-6);
+  equation 6 as printed weighs radiance, which holds its weights already, a second time: `"printed"`;
+- Optimized is not in the code either. Chosen here: the three shares of the levels are a softmax at every
+  pixel, levels are enlarged bilinearly and halved by averaging 2x2, each has a kernel generator of its own.
+
+Ours: radiance is multiplied by `exposure` first and the result divided; depth is divided by the largest of
+the frame, motion by 128 pixels and the circle of confusion by 2, which gives the authors' numbers on their
+frames; what the networks see is clipped to +-1000; samples that are not finite are dropped; and images are
+padded with pixels without samples where the grid of the U-Net asks for it.
+
+Published, 8 spp, 36 test images (Tables 1 and 4; relMSE, SMAPE, SSIM, PSNR): PixelGather 0.0352, 0.0353,
+0.938, 33.706; SampleSplat 0.0298, 0.0344, 0.941, 33.878; Layer alpha 0.0288, 0.0350, 0.941, 33.838; weighted
+0.0295, 0.0350, 0.940, 33.812; Optimized 0.0351, 0.0361, 0.935, 33.435. What small forms reach here is in
+configs/layers_sample.yaml.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from data.buffers import sample_channels
+from models.blocks.per_sample import Frame, PerSample, Seen
+from models.blocks.pointwise import Pointwise
+from models.blocks.unet import UNet, Upsampling, enlarged
+from models.denoiser import Buffers, Denoised
+from models.ops.precision import wide
+from models.ops.splat import gather_inside, source_maximum, splat_exp
+from models.ops.streaming import scattered, streamed
+
+EPSILON = 1e-6
+"""Added to sums of weights before something is divided by them."""
+
+FEATURES = len(sample_channels(*PerSample.samples))
+"""Channels of a sample: 20."""
+
+_LAYER_ORDER = (
+    "radiance",
+    "normal",
+    "depth",
+    "motion",
+    "coc",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "lens",
+    "time",
+)
+_PIXEL_ORDER = (
+    "radiance",
+    "normal",
+    "depth",
+    "diffuse_albedo",
+    "specular_albedo",
+    "roughness",
+    "lens",
+    "time",
+    "motion",
+    "coc",
+)
+
+SCALES = 3
+"""Levels on which Optimized filters."""
+
+_NEVER = 1e30
+"""Taken from logits of samples that do not count, so that they are no maximum."""
+
+Compositing = Literal["alpha", "weighted", "printed"]
+
+
+class Layered(NamedTuple):
+    """What becomes of the layers (figure 5 of the paper).
+
+    Attributes:
+        unfiltered: Radiance that was sorted into each layer, linear, (B, L, 3, H, W); their sum is the mean
+            of the samples.
+        filtered: Filtered radiance of each layer, weighted by alpha.
+        alpha: Opacity of each layer (B, L, 1, H, W); with weighted layers, its share of the weights.
+        color: The composite (B, 3, H, W).
+    """
+
+    unfiltered: Tensor
+    filtered: Tensor
+    alpha: Tensor
+    color: Tensor
+
+
+class Sorted(NamedTuple):
+    """What layers hold: radiance (B, L, 3, H, W), weight (B, L, 1, H, W), embedding (B, L, E, H, W)."""
+
+    radiance: Tensor
+    weight: Tensor
+    embedding: Tensor
+
+
+class Composite(NamedTuple):
+    """Filtered radiance and alpha of each layer, and the image; see `Layered`."""
+
+    filtered: Tensor
+    alpha: Tensor
+    color: Tensor
+
+
+class _Sampled(PerSample):
+    """What Layer and SampleSplat share: embeddings of samples, and context of their mean."""
+
+    def __init__(
+        self,
+        kernel_size: int,
+        width: int,
+        levels: int,
+        embedding: int,
+        upsampling: Upsampling,
+        recompute: bool,
+        fill: Mapping[str, float] | None,
+    ) -> None:
+        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
+        self.reducer = Pointwise(FEATURES, *[embedding] * 3, linear=False)
+        self.halo = self.unet.halo([kernel_size // 2])
+
+    def _embedded(self, seen: Seen) -> Tensor:
+        """Return embeddings (B, S, E, H, W)."""
+        made = self.reducer(seen.features.flatten(0, 1))
+        return wide(made).reshape(*seen.features.shape[:2], *made.shape[1:])
+
+    def _contexts(self, frame: Frame) -> list[Tensor]:
+        """Return the stages of the U-Net, from fine to coarse, for the mean embedding of each pixel."""
+
+        def mean(samples: Tensor) -> Tensor:
+            seen = self._seen(samples, frame)
+            total = (self._embedded(seen) * seen.counts).sum(1)
+            return total / seen.counts.sum(1).clamp_min(1.0)
+
+        numbers = self._images(frame) * (FEATURES + 3 * self.embedding)
+        return list(self.unet(streamed(mean, [frame.samples], numbers, self.recompute)))
+
+
+class Layer(_Sampled):
+    """Samples sorted into layers, which are splatted and composited: Munkberg and Hasselgren 2020.
+
+    Args:
+        layers: Layers, from 2 to 5 in the paper; 1 is a splat of pixels.
+        compositing: `alpha` front to back; `weighted` sum of layers; `printed`: that as equation 6 stands.
+        kernel_size: Rows and columns of the kernels, odd.
+        width: Channels of the U-Net at full resolution; its other widths and those of the kernel generator
+            follow from it.
+        levels: How often the U-Net halves the resolution.
+        embedding: Channels of an embedding.
+        upsampling: In the U-Net: `nearest` (authors' code) or `bilinear` (paper).
+        recompute: In training, compute what belongs to single samples again in the backward pass.
+        fill: Quantity → the constant that stands for it where samples lack it, such as `{"lens": 0}`.
+
+    Raises:
+        ValueError: An argument is out of range; the message names it.
+    """
+
+    order = _LAYER_ORDER
+
+    def __init__(
+        self,
+        layers: int = 2,
+        compositing: Compositing = "alpha",
+        kernel_size: int = 17,
+        width: int = 64,
+        levels: int = 5,
+        embedding: int = 32,
+        upsampling: Upsampling = "nearest",
+        recompute: bool = True,
+        fill: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
+        if compositing not in ("alpha", "weighted", "printed"):
+            raise ValueError(f"compositing {compositing!r}; expected alpha, weighted or printed")
+        if not 1 <= layers <= 5:
+            raise ValueError(f"layers is {layers}; expected 1 to 5")
+        self.layers, self.compositing = layers, compositing
+        self.partitioner = Pointwise(embedding + self.context, 32, 16, layers, linear=True)
+        self.generator = self._generator()
+
+    def _generator(self) -> nn.Module:
+        hidden = 2 * self.width
+        return Pointwise(self.embedding + self.context, hidden, hidden, self.kernel_size**2, linear=True)
+
+    def forward(self, buffers: Buffers) -> Denoised:
+        """Denoise; see `Denoiser.forward`.
+
+        Args:
+            buffers: `samples` (B, S, 20, H, W), the quantities of `samples` in their order, raw; optionally
+                `exposure` (B,) and `depth_range` (B, 2).
+
+        Raises:
+            ValueError: Samples are missing or have another shape.
+        """
+        return Denoised(self.layered(buffers).color)
+
+    def layered(self, buffers: Buffers) -> Layered:
+        """Return what becomes of each layer, from the same buffers as `forward`; linear radiance."""
+        frame = self._frame(buffers)
+        contexts = self._contexts(frame)
+        layers = self._sorted(frame, contexts[0])
+        made = self._composited(layers, contexts)
+        radiance, filtered, color = (
+            self._cropped(part, buffers) for part in (layers.radiance, made.filtered, made.color)
+        )
+        height, width = color.shape[-2:]
+        return Layered(radiance, filtered, made.alpha[..., :height, :width], color)
+
+    def _sorted(self, frame: Frame, context: Tensor) -> Sorted:
+        """Sort the samples into layers."""
+
+        def shares(samples: Tensor, context: Tensor) -> Tensor:
+            seen = self._seen(samples, frame)
+            embedding = self._embedded(seen)
+            share = torch.softmax(wide(self.partitioner.joint(embedding, context)), 2)
+            share = share * (seen.counts / seen.counts.sum(1, keepdim=True).clamp_min(1.0))
+            layers = []
+            for weight in share.split(1, 2):
+                layers += [(weight * seen.radiance).sum(1), weight.sum(1), (weight * embedding).sum(1)]
+            made = torch.cat(layers, 1)
+            return made.reshape(made.shape[0], self.layers, -1, *made.shape[2:])
+
+        numbers = self._images(frame) * (FEATURES + 3 * self.embedding + 48)
+        made = streamed(shares, [frame.samples, context], numbers, self.recompute)
+        return Sorted(*made.split([3, 1, self.embedding], 2))
+
+    def _composited(self, layers: Sorted, contexts: list[Tensor]) -> Composite:
+        assert isinstance(self.generator, Pointwise)
+        return self._filtered(layers, contexts[0], self.generator)
+
+    def _filtered(self, layers: Sorted, context: Tensor, generator: Pointwise) -> Composite:
+        """Splat layers with the kernels of their embeddings and the context, and composite them."""
+        taps, radius = self.kernel_size**2, self.kernel_size // 2
+        values = torch.cat([layers.radiance, layers.weight, occupancy(layers.weight)], 2)
+
+        def spread(embedding: Tensor, context: Tensor, values: Tensor) -> Tensor:
+            logits = wide(generator.joint(embedding, context)[:, :, :taps])
+            shift = source_maximum(logits).expand(values[:, :, :1].shape)
+            each = (part.flatten(0, 1)[:, None] for part in (values, logits, shift))
+            return _rows(*each, radius).reshape(*values.shape[:3], -1, values.shape[-1])
+
+        numbers = values.shape[0] * values.shape[1] * (taps + self.context)
+        tensors = [layers.embedding, context, values]
+        return self._finish(scattered(spread, tensors, radius, numbers, self.recompute))
+
+    def _finish(self, sums: Tensor) -> Composite:
+        """Composite layers of which radiance, weight and occupancy (B, L, 5, H, W) arrived at each pixel."""
+        radiance, weight, occupied = sums.split([3, 1, 1], 2)
+        if self.compositing == "alpha":
+            filtered, alpha = radiance / (occupied + EPSILON), weight / (occupied + EPSILON)
+            color, seen = torch.zeros_like(filtered[:, 0]), torch.ones_like(alpha[:, 0])
+            for layer in range(self.layers):
+                color = color + seen * filtered[:, layer]
+                seen = seen * (1 - alpha[:, layer])
+            return Composite(filtered, alpha, color)
+        if self.compositing == "printed":
+            radiance = radiance * weight
+        total = weight.sum(1, keepdim=True) + EPSILON
+        filtered = radiance / total
+        return Composite(filtered, weight / total, filtered.sum(1))
+
+
+class Optimized(Layer):
+    """Layer (alpha) with 5x5 kernels on three levels and narrower networks: section 6 of the paper.
+
+    Args:
+        layers: Layers.
+        kernel_size: Rows and columns of the kernels of every level, odd.
+        width: Half the channels of the context; other widths follow from it.
+        levels: How often the U-Net halves the resolution, at least 3.
+        narrow_context: Half as many channels of the context at full resolution.
+        embedding, upsampling, recompute, fill: As for `Layer`.
+
+    Raises:
+        ValueError: An argument is out of range; the message names it.
+    """
+
+    def __init__(
+        self,
+        layers: int = 2,
+        kernel_size: int = 5,
+        width: int = 64,
+        levels: int = 5,
+        embedding: int = 32,
+        narrow_context: bool = False,
+        upsampling: Upsampling = "nearest",
+        recompute: bool = True,
+        fill: Mapping[str, float] | None = None,
+    ) -> None:
+        if levels < SCALES:
+            raise ValueError(f"levels is {levels}; Optimized filters on {SCALES} and needs as many")
+        self.narrow_context = narrow_context
+        super().__init__(layers, "alpha", kernel_size, width, levels, embedding, upsampling, recompute, fill)
+        # An enlarged pixel depends on its neighbour on that level, that on all which reach it, and what these
+        # hold on the context of their pixels at full resolution.
+        reach = kernel_size // 2 + 1
+        self.halo = self.unet.halo([reach * 2 ** (SCALES - 1), *[reach] * (SCALES - 1)])
+
+    def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
+        w = self.width
+        if self.narrow_context:
+            self.context = w
+        encoder, decoder = (2 * w, 4 * w, 8 * w, 8 * w), (8 * w, 4 * w, 2 * w, w, w)
+        return UNet(
+            self.embedding, w // 2, encoder[: levels - 1], decoder[-levels:], self.context, upsampling
+        )
+
+    def _generator(self) -> nn.Module:
+        hidden, taps = self.width // 2, self.kernel_size**2
+        contexts = (self.context, self.width, 2 * self.width)
+        return nn.ModuleList(
+            Pointwise(self.embedding + context, hidden, hidden, taps + (0 if level else SCALES), linear=True)
+            for level, context in enumerate(contexts)
+        )
+
+    def _composited(self, layers: Sorted, contexts: list[Tensor]) -> Composite:
+        assert isinstance(self.generator, nn.ModuleList)
+        shares = self._shares(layers.embedding[:, :1], contexts[0])
+        color, finest = torch.zeros_like(layers.radiance[:, 0]), None
+        for level, generator in enumerate(self.generator):
+            assert isinstance(generator, Pointwise)
+            made = self._filtered(_smaller(layers, 2**level), contexts[level], generator)
+            finest = made if finest is None else finest
+            image = enlarged(made.color, 2**level, "bilinear") if level else made.color
+            color = color + image * shares[:, level : level + 1]
+        assert finest is not None
+        return Composite(finest.filtered, finest.alpha, color)
+
+    def _shares(self, embedding: Tensor, context: Tensor) -> Tensor:
+        """Return the share of each level in every pixel (B, 3, H, W), from the first layer's generator."""
+        generator, taps = self.generator[0], self.kernel_size**2  # type: ignore[index]
+
+        def shares(embedding: Tensor, context: Tensor) -> Tensor:
+            return torch.softmax(wide(generator.joint(embedding, context)[:, 0, taps:]), 1)
+
+        return streamed(shares, [embedding, context], embedding.shape[0] * self.context, self.recompute)
+
+
+class SampleSplat(_Sampled):
+    """A kernel for every sample: the paper's form of Gharbi et al. 2019.
+
+    Args:
+        kernel_size, width, levels, embedding, upsampling, recompute, fill: As for `Layer`.
+
+    Raises:
+        ValueError: An argument is out of range; the message names it.
+    """
+
+    order = _PIXEL_ORDER
+
+    def __init__(
+        self,
+        kernel_size: int = 17,
+        width: int = 64,
+        levels: int = 5,
+        embedding: int = 32,
+        upsampling: Upsampling = "nearest",
+        recompute: bool = True,
+        fill: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
+        hidden = 2 * width
+        self.generator = Pointwise(embedding + self.context, hidden, hidden, kernel_size**2, linear=True)
+
+    def forward(self, buffers: Buffers) -> Denoised:
+        """Denoise; see `Layer.forward`."""
+        frame = self._frame(buffers)
+        context = self._contexts(frame)[0]
+        taps, radius = self.kernel_size**2, self.kernel_size // 2
+
+        def spread(samples: Tensor, context: Tensor) -> Tensor:
+            seen = self._seen(samples, frame)
+            logits = wide(self.generator.joint(self._embedded(seen), context))
+            logits = logits + (seen.counts - 1) * _NEVER
+            values = torch.cat([seen.radiance, seen.counts], 2)
+            return _rows(values, logits, source_maximum(logits), radius)
+
+        numbers = self._images(frame) * (taps + self.context)
+        sums = scattered(spread, [frame.samples, context], radius, numbers, self.recompute)
+        return Denoised(self._cropped(sums[:, :3] / (sums[:, 3:] + EPSILON), buffers))
+
+
+class PixelGather(PerSample):
+    """A kernel for every pixel, from mean and variance of its samples; filters their mean.
+
+    Args:
+        kernel_size, width, levels, embedding, upsampling, recompute, fill: As for `Layer`.
+
+    Raises:
+        ValueError: An argument is out of range; the message names it.
+    """
+
+    order = _PIXEL_ORDER
+
+    def __init__(
+        self,
+        kernel_size: int = 17,
+        width: int = 64,
+        levels: int = 5,
+        embedding: int = 32,
+        upsampling: Upsampling = "nearest",
+        recompute: bool = True,
+        fill: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
+        hidden = 2 * width
+        self.reducer = Pointwise(2 * FEATURES, *[embedding] * 3, linear=False)
+        self.generator = Pointwise(embedding + self.context, hidden, hidden, kernel_size**2, linear=True)
+        self.halo = max(self.unet.halo([0]), kernel_size // 2)
+
+    def forward(self, buffers: Buffers) -> Denoised:
+        """Denoise; see `Layer.forward`."""
+        frame = self._frame(buffers)
+
+        def moments(samples: Tensor) -> Tensor:
+            seen = self._seen(samples, frame)
+            count = seen.counts.sum(1).clamp_min(1.0)
+            mean = seen.features.sum(1) / count
+            spread = ((seen.features - mean[:, None]).square() * seen.counts).sum(1) / count
+            return torch.cat([seen.radiance.sum(1) / count, seen.counts.amax(1), mean, spread], 1)
+
+        numbers = self._images(frame) * 3 * FEATURES
+        image, counts, features = streamed(moments, [frame.samples], numbers, self.recompute).split(
+            [3, 1, 2 * FEATURES], 1
+        )
+        embedding = wide(self.reducer(features))
+        context = self.unet(embedding)[0]
+        logits = wide(self.generator.joint(embedding[:, None], context))[:, 0]
+        sums = gather_inside(torch.cat([image, counts], 1), logits, self.kernel_size)
+        return Denoised(self._cropped(sums[:, :3] / sums[:, 3:].clamp_min(1e-20), buffers))
+
+
+def occupancy(weight: Tensor) -> Tensor:
+    """Return the weights of each layer and those behind it, summed: (B, L, 1, H, W) of the same."""
+    last, *front = weight.unbind(1)[::-1]
+    behind = [last]
+    for layer in front:
+        behind.append(behind[-1] + layer)
+    return torch.stack(behind[::-1], 1)
+
+
+def _rows(values: Tensor, logits: Tensor, shift: Tensor, radius: int) -> Tensor:
+    """Splat (N, M, V, h, W) and return what arrives, summed over M, with the rows above and below that are
+    reached: (N, V, h + 2 radius, W)."""
+    margin = (0, 0, radius, radius)
+    padded = (F.pad(part, margin) for part in (values, logits, shift))
+    values, logits, shift = padded
+    return splat_exp(values, logits, 2 * radius + 1, shift).total
+
+
+def _smaller(layers: Sorted, factor: int) -> Sorted:
+    """Return layers of which factor x factor pixels are averaged."""
+    if factor == 1:
+        return layers
+    made = (F.avg_pool2d(part.flatten(0, 1), factor) for part in layers)
+    return Sorted(*(m.reshape(*p.shape[:2], *m.shape[1:]) for m, p in zip(made, layers, strict=True)))
