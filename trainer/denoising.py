@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from data.buffers import buffer
+from data.buffers import SAMPLES, buffer
 from data.derive import automatic_exposure, derive
 from data.frame import Frame, Image
 from data.temporal import Accumulator
@@ -24,6 +24,7 @@ from trainer.attention import Attention, attention_of, attentive, inside
 from trainer.clips import Clip
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.loading import Loaded
+from trainer.samples import LayerImages, dropped, layers_of, sample_tensor, with_layers
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Settings:
         memory: Bytes that one call of the model may take; larger images are tiled.
         device: Where to run.
         attention: Column and row of the pixel whose attention is wanted.
+        layers: Whether the layers of the model are wanted.
     """
 
     exposure: float | None = None
@@ -45,6 +47,7 @@ class Settings:
     memory: int = 2 * 1024**3
     device: str = "cpu"
     attention: tuple[int, int] | None = None
+    layers: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class Result:
         accumulated: Radiance accumulated over the preceding frames, None where that was not done.
         reference: Converged radiance, None where the frame has none.
         attention: Of the pixel that the settings name, None where they name none.
+        layers: What became of the layers, None where that is not wanted.
     """
 
     frame: Frame
@@ -66,6 +70,7 @@ class Result:
     accumulated: Image | None
     reference: Image | None
     attention: Attention | None = None
+    layers: LayerImages | None = None
 
 
 def replaced_pixels(frame: Frame) -> str | None:
@@ -75,6 +80,11 @@ def replaced_pixels(frame: Frame) -> str | None:
     """
     parts = []
     for name, number in frame.notes.get("repaired", {}).items():
+        if name == SAMPLES:
+            parts.append(
+                f"{number} values of samples were NaN or Inf, replaced by those of rays that hit nothing"
+            )
+            continue
         neighbours = buffer(name).repair == "neighbours"
         by = "the mean of their finite neighbours, 0 where there are none" if neighbours else _no_hit(name)
         parts.append(f"{_pixels(number, name)} NaN or Inf, replaced by {by}")
@@ -101,7 +111,7 @@ class ClipDenoiser:
         say: Called with each remark for the user; the caller may show each only once.
 
     Raises:
-        ValueError: Attention is wanted and the model has none to look at.
+        ValueError: Attention or layers are wanted and the model has none to look at.
     """
 
     def __init__(self, loaded: Loaded, clip: Clip, settings: Settings, say: Callable[[str], None]) -> None:
@@ -109,6 +119,8 @@ class ClipDenoiser:
         self.model = loaded.model.deploy().eval()
         if settings.attention is not None:
             attentive(loaded.model, loaded.source.reference)
+        if settings.layers:
+            with_layers(loaded.model, loaded.source.reference)
         self.clip = clip
         self.settings = settings
         self.say = say
@@ -147,6 +159,7 @@ class ClipDenoiser:
             exposure=exposure,
             accumulated=False,
             notes=self._provenance(exposure),
+            samples=None,
         )
         return Result(
             result,
@@ -155,6 +168,7 @@ class ClipDenoiser:
             self._noisy(frame) if frame.accumulated else None,
             frame.buffers.get("reference"),
             self._attention(buffers),
+            self._layers(buffers),
         )
 
     def _follows(self, frame: Frame) -> bool:
@@ -166,7 +180,7 @@ class ClipDenoiser:
         )
 
     def _wanted(self, frame: Frame) -> list[str]:
-        names = list(self.model.inputs)
+        names = [name for name in self.model.inputs if name != SAMPLES]
         temporal = self._accumulates(frame)
         return [*names, "irradiance", "albedo"] if temporal else names
 
@@ -214,11 +228,17 @@ class ClipDenoiser:
         return derive(frame, ["color"]).buffers["color"]
 
     def _tensors(self, frame: Frame, exposure: float) -> dict[str, Tensor]:
-        frame.require(*self.model.inputs)
+        names = [name for name in self.model.inputs if name != SAMPLES]
+        frame.require(*names)
         buffers: dict[str, Tensor] = {
             name: torch.from_numpy(np.ascontiguousarray(frame.buffers[name].transpose(2, 0, 1)))[None]
-            for name in self.model.inputs
+            for name in names
         }
+        if SAMPLES in self.model.inputs:
+            assert isinstance(self.model, Denoiser)
+            buffers[SAMPLES] = sample_tensor(frame, self.model)
+            if lost := dropped(buffers[SAMPLES]):
+                self.say(f"{frame.label}: {lost}")
         buffers = {name: value.to(self.settings.device) for name, value in buffers.items()}
         if "exposure" in self.model.frame_numbers:
             buffers["exposure"] = torch.tensor([exposure], dtype=torch.float32, device=self.settings.device)
@@ -229,6 +249,12 @@ class ClipDenoiser:
             return None
         model = attentive(self.loaded.model, self.loaded.source.reference)
         return attention_of(model, buffers, self.settings.attention)
+
+    def _layers(self, buffers: dict[str, Tensor]) -> LayerImages | None:
+        if not self.settings.layers:
+            return None
+        model = with_layers(self.model, self.loaded.source.reference)
+        return layers_of(model, buffers, self.settings.memory)
 
     def _provenance(self, exposure: float) -> dict[str, Any]:
         model = self.loaded.model

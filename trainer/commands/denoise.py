@@ -72,6 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-accumulate", action="store_true", help="do not accumulate sequences over preceding frames"
     )
+    parser.add_argument(
+        "--layers",
+        action="store_true",
+        help="write a folder of pictures of every layer before and after filtering, and its opacity (Layer, "
+        "Optimized)",
+    )
     parser.add_argument("--force", action="store_true", help="replace results that are already there")
 
 
@@ -95,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     _check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
-    wanted = _Wanted(args.output, args.png, args.attention is not None)
+    wanted = _Wanted(args.output, args.png, args.attention is not None, args.layers)
     outputs = [path for item in items for path in wanted.paths(item).values()]
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
@@ -103,7 +109,13 @@ def run(args: argparse.Namespace) -> int:
     loaded = resolve(args.model, args.device)
     number = args.exposure if isinstance(args.exposure, float) else None
     settings = Settings(
-        number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device, args.attention
+        number,
+        args.exposure == "auto",
+        not args.no_accumulate,
+        args.memory,
+        args.device,
+        args.attention,
+        args.layers,
     )
     with _progress(len(items)) as progress:
         for clip in clips:
@@ -160,6 +172,7 @@ class _Wanted:
     folder: Path
     png: bool
     attention: bool
+    layers: bool = False
 
     def paths(self, item: Item) -> dict[str, Path]:
         """Return the files of a frame by what they show; those of pictures only where they are wanted."""
@@ -168,6 +181,8 @@ class _Wanted:
             suffixes |= {"denoised": ".png", "comparison": "_comparison.png"}
         if self.attention:
             suffixes["attention"] = "_attention.png"
+        if self.layers:
+            suffixes["layers"] = "_layers"
         return {kind: self.folder / f"{item.name}{suffix}" for kind, suffix in suffixes.items()}
 
 
@@ -223,6 +238,11 @@ def _write(result: Result, paths: dict[str, Path]) -> None:
     for kind, image in pictures.items():
         with replacing(paths[kind]) as temporary:
             image.save(temporary)
+    if result.layers is not None:
+        paths["layers"].mkdir(exist_ok=True)
+        for name, image in result.layers.pictures(result.exposure).items():
+            with replacing(paths["layers"] / f"{name}.png") as temporary:
+                image.save(temporary)
     write_frame(result.frame, exr)  # last: a frame with its EXR is finished
 
 

@@ -1,0 +1,114 @@
+"""`trainer denoise` on frames that keep their samples apart, and the pictures of layers."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import trainer.loading
+from data.exr import read_frame
+from data.frame import Frame, Samples
+from data.root import resolve_root
+from models import Layer, PixelGather
+from models.denoiser import select
+from models.ops.per_sample import sample_counts
+from trainer.commands import denoise as command
+from trainer.export.description import Source
+from trainer.loading import Loaded
+from trainer.samples import dropped, layers_of, sample_tensor
+
+SMALL: dict[str, Any] = {"width": 4, "levels": 2, "kernel_size": 3, "embedding": 6}
+FRAME = resolve_root("sample:layers").path / "indoor-000104" / "f000.exr"
+
+
+def small(kind: type = Layer, **arguments: Any) -> Any:
+    torch.manual_seed(3)
+    return kind(**{**SMALL, **arguments}).eval()
+
+
+def denoise(monkeypatch: pytest.MonkeyPatch, model: Any, output: Path, *options: str) -> int:
+    monkeypatch.setattr(trainer.loading, "resolve", lambda *_: Loaded(model, Source("small")))
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    arguments = [str(FRAME), "--model", "small", "--output", str(output), *options]
+    return command.run(parser.parse_args(arguments))
+
+
+def test_frames_with_samples_are_denoised_from_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small(PixelGather)
+    assert denoise(monkeypatch, model, tmp_path, "--exposure", "0.25") == 0
+    found = read_frame(tmp_path / "f000.exr")
+    frame = read_frame(FRAME)
+    assert frame.samples is not None
+    assert found.samples is None
+    values = torch.from_numpy(frame.samples.values.transpose(0, 3, 1, 2).copy())[None]
+    batch = {"samples": values, "sample_channels": frame.samples.channels, "exposure": torch.tensor([0.25])}
+    with torch.no_grad():
+        expected = model(select(model, batch)).color[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(found.buffers["color"], expected, rtol=2e-3, atol=1e-4)
+
+
+def test_layers_are_written_as_pictures_of_before_after_and_opacity(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denoise(monkeypatch, small(layers=3), tmp_path, "--layers")
+    names = {path.name for path in (tmp_path / "f000_layers").iterdir()}
+    parts = ("unfiltered", "filtered", "alpha")
+    assert names == {"composite.png", *(f"layer{n}-{part}.png" for n in range(3) for part in parts)}
+    with Image.open(tmp_path / "f000_layers" / "layer1-alpha.png") as alpha:
+        assert (alpha.size, alpha.mode) == ((64, 64), "L")
+    with pytest.raises(ValueError, match="f000"):  # what is there is not overwritten
+        denoise(monkeypatch, small(layers=3), tmp_path, "--layers")
+
+
+def test_layers_of_a_model_without_any_are_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ValueError, match=r"--layers needs a model with layers .* small has none"):
+        denoise(monkeypatch, small(PixelGather), tmp_path, "--layers")
+
+
+def test_layers_in_tiles_are_those_of_the_whole_frame() -> None:
+    model = small()
+    buffers = {"samples": sample_tensor(read_frame(FRAME), model)[..., :50, :]}
+    whole = layers_of(model, buffers, 10**9)
+    needed = (16 + 2 * model.halo) * 64 * model.bytes_per_pixel
+    tiled = layers_of(model, buffers, needed)
+    for name in ("unfiltered", "filtered", "alpha", "composite"):
+        one, other = getattr(tiled, name), getattr(whole, name)
+        assert one.shape[1 if name != "composite" else 0] == 50
+        np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())
+
+
+def test_a_frame_without_samples_is_refused_with_what_was_expected() -> None:
+    frame = Frame({"color": np.ones((16, 16, 3), np.float32)}, "wall", 0)
+    with pytest.raises(ValueError, match=r"wall/frame 0: Layer reads the samples .* s00\.radiance\.R"):
+        sample_tensor(frame, small())
+
+
+def test_a_missing_guide_is_named_with_the_frame_or_filled() -> None:
+    parts = {"radiance": np.ones((2, 16, 16, 3), np.float32), "depth": np.ones((2, 16, 16, 1), np.float32)}
+    frame = Frame({"color": np.ones((16, 16, 3), np.float32)}, "wall", 0, samples=Samples.of(parts))
+    with pytest.raises(ValueError, match="wall/frame 0: the samples have no normal, diffuse_albedo"):
+        sample_tensor(frame, small())
+    guides = ("normal", "diffuse_albedo", "specular_albedo", "roughness", "motion", "coc", "lens", "time")
+    filled = sample_tensor(frame, small(fill=dict.fromkeys(guides, 0.5)))
+    assert filled.shape == (1, 2, 20, 16, 16)
+    assert (filled[:, :, 7:] == 0.5).all()
+
+
+def test_dropped_samples_and_pixels_without_any_are_counted() -> None:
+    samples = torch.zeros(1, 3, 20, 4, 4)
+    assert dropped(samples) is None
+    samples[0, :, 4, 1, 2], samples[0, 1, 0, 3, 3] = torch.nan, torch.inf
+    assert sample_counts(samples)[0, 0].tolist()[1] == [3, 3, 0, 3]
+    assert dropped(samples) == (
+        "4 samples with NaN or Inf in 2 pixels were dropped; "
+        "1 pixels had no other and were filled from around them"
+    )
