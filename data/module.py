@@ -48,8 +48,8 @@ class Shards(LightningDataModule):
         drop_history: Share of training patches whose input is not accumulated.
         train_patches: Training patches per 1280x720 frame, where the root is prepared here; with the recipe
             `afgsa` the candidates, of which about two thirds are kept. None: as the recipe says, 80 as in
-            WSKP without one; for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES` or
-            `data.sample.CANDIDATES`.
+            WSKP without one; for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES`,
+            `data.sample.CANDIDATES` or `data.sample.CROPS`.
         validation_patches: Validation patches per 1280x720 frame, where the root is prepared here; None: as
             the recipe says, 20 without one.
         patch_size: Width and height of patches, where the root is prepared here.

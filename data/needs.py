@@ -8,7 +8,7 @@ from pathlib import Path
 from data.buffers import SAMPLES
 from data.manifest import FrameRecord
 from data.root import SAMPLE
-from data.sample import CANDIDATES, TRAIN_PATCHES
+from data.sample import CANDIDATES, CROPS, TRAIN_PATCHES
 from data.shards.options import recipe_options
 
 
@@ -24,7 +24,9 @@ def patch_number(root: str, recipe: str | None, number: int | None) -> dict[str,
     sample = root.startswith(SAMPLE)
     if recipe_options(recipe, {}).sampling == "importance":
         return {"candidates": CANDIDATES if number is None and sample else number}
-    return {"train_patches": TRAIN_PATCHES if number is None and recipe is None and sample else number}
+    if number is None and sample:
+        number = {None: TRAIN_PATCHES, "layers": CROPS}.get(recipe)
+    return {"train_patches": number}
 
 
 def explain_lacking(reader: str, root: Path, record: FrameRecord, missing: Sequence[str]) -> str:

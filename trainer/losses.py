@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from models.ops.tonemap import srgb_log
+
 
 class SMAPE(nn.Module):
     """Symmetric mean absolute percentage error, `mean |o - t| / (|o| + |t| + epsilon)`.
@@ -57,3 +59,11 @@ class RelativeL2(nn.Module):
         output, target = output.float(), target.float()
         scale = output.detach() if self.symmetric else target
         return (torch.square(output - target) / (torch.square(scale) + self.epsilon)).mean()
+
+
+class TonemappedL2(nn.Module):
+    """Mean squared difference of sRGB(log(1 + x)), of Munkberg and Hasselgren 2020, section 4."""
+
+    def forward(self, output: Tensor, target: Tensor) -> Tensor:
+        """Return the mean over all elements of (B, 3, H, W)."""
+        return (srgb_log(output.float()) - srgb_log(target.float())).square().mean()

@@ -18,3 +18,7 @@ density its few small frames give 5 patches each, too few to learn from."""
 CANDIDATES = 3600
 """Candidates of importance sampling per 1280x720 frame that a sample is prepared with unless told otherwise:
 a hundred per frame of 160x160, of which about two thirds are kept."""
+
+CROPS = 7200
+"""Crops per 1280x720 frame of frames with samples of each pixel that a sample is prepared with unless told
+otherwise: 32 per frame of 64x64."""

@@ -12,12 +12,18 @@ from trainer import configs
 
 SMOKE = "smoke.yaml"
 SAMPLES = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
+SAMPLES |= {f"{name}_sample.yaml": f"{name}_random.yaml" for name in ("layers", "pixelgather", "samplesplat")}
+SAMPLES["layers_optimized_sample.yaml"] = "layers_optimized.yaml"
 """Overlay → what it is laid over."""
 
 NARROW = {
     "acfm_tungsten.yaml": {"net.init_args": {"blocks": 1, "width": 8, "condition_width": 8, "condition": 4}},
     "afgsa_tungsten.yaml": {"net.init_args": {"blocks": 1, "width": 16}},
     "kpcn_tungsten.yaml": {"net.init_args": {"layers": 2, "width": 4}},
+    **{
+        f"{name}.yaml": {"net.init_args": {"width": 4, "kernel_size": 5}}
+        for name in ("layers_random", "pixelgather_random", "samplesplat_random", "layers_optimized")
+    },
 }
 """Networks whose published size would take a minute for a step; their tests build them in that size."""
 for name in ("acfm_tungsten.yaml", "afgsa_tungsten.yaml"):
@@ -100,5 +106,5 @@ def test_an_overlay_keeps_method_and_data_of_what_it_is_laid_over(overlay, base)
     assert over["model"]["class_path"] == under["model"]["class_path"]
     networks = [file["model"]["init_args"]["net"]["class_path"] for file in (over, under)]
     assert networks[0] == networks[1]
-    assert under["data"]["init_args"]["root"] == "sample:stills"
+    assert under["data"]["init_args"]["root"] in ("sample:stills", "sample:layers")
     assert "root" not in over["data"]["init_args"]

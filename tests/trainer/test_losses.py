@@ -1,7 +1,9 @@
+import math
+
 import pytest
 import torch
 
-from trainer.losses import L1, SMAPE, RelativeL2
+from trainer.losses import L1, SMAPE, RelativeL2, TonemappedL2
 
 
 def test_smape_is_the_mean_of_the_written_ratio():
@@ -32,3 +34,13 @@ def test_losses_compute_in_float32_and_stay_finite_on_half_maximum(loss):
     value = loss(output, torch.zeros(1, 3, 4, 4, dtype=torch.bfloat16))
     assert value.dtype == torch.float32
     assert torch.isfinite(value)
+
+
+def test_tonemapped_l2_compares_srgb_of_the_logarithm():
+    output, target = torch.tensor([0.0, 0.5, 7.0]), torch.tensor([0.001, 0.25, 70000.0])
+    curve = [
+        1.055 * v ** (1 / 2.4) - 0.055 if v > 0.0031308 else 12.92 * v
+        for v in (math.log(1 + min(max(x, 1e-5), 65536.0)) for x in (*output.tolist(), *target.tolist()))
+    ]
+    expected = sum((a - b) ** 2 for a, b in zip(curve[:3], curve[3:], strict=True)) / 3
+    assert TonemappedL2()(output, target).item() == pytest.approx(expected, rel=1e-5)

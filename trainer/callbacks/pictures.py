@@ -85,6 +85,8 @@ class ValidationPictures(Callback):
     @torch.no_grad()
     def _strip(self, module: LightningModule, batch: dict[str, Any], row: int) -> Any:
         one = {k: v[row : row + 1] for k, v in batch.items() if isinstance(v, torch.Tensor)}
+        if "sample_channels" in batch:
+            one["sample_channels"] = batch["sample_channels"]
         net = cast(Denoiser, module.net)
         images = {
             "noisy": one.get("color"),

@@ -6,10 +6,13 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_, clip_grad_value_
+from torch.optim import Optimizer
 
 from models.denoiser import Denoiser
 from trainer.losses import SMAPE
 from trainer.modules.evaluation import Batch, Evaluated
+from trainer.modules.updates import check_number
 from trainer.schedules import MakeOptimizer, MakeSchedule, scheduled
 
 
@@ -25,6 +28,9 @@ class Regression(Evaluated):
         optimizer: Makes the optimiser from the parameters; a class path in a configuration.
         lr_scheduler: Makes a learning-rate schedule: `trainer.schedules.OneCycle` is stepped after every
             step, the schedules of PyTorch after every epoch; none by default.
+        clip_norm: Gradients are scaled down to this norm, before `clip_value`; the trainer's
+            `gradient_clip_val` does one of both.
+        clip_value: Every number of a gradient is clipped to +- this.
     """
 
     def __init__(
@@ -33,9 +39,14 @@ class Regression(Evaluated):
         loss: nn.Module | None = None,
         optimizer: MakeOptimizer = torch.optim.Adam,
         lr_scheduler: MakeSchedule | None = None,
+        clip_norm: float | None = None,
+        clip_value: float | None = None,
     ) -> None:
         super().__init__(net)
         self.keep_arguments()
+        check_number("clip_norm", clip_norm)
+        check_number("clip_value", clip_value)
+        self.clip_norm, self.clip_value = clip_norm, clip_value
         self.loss = loss if loss is not None else SMAPE()
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
@@ -51,6 +62,30 @@ class Regression(Evaluated):
         """Return the loss of exposed output and reference."""
         loss: Tensor = self.loss(output, target)
         return loss
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip norm and values, each where it is asked for; or as the trainer says.
+
+        Raises:
+            ValueError: Both say it.
+        """
+        own = self.clip_norm is not None or self.clip_value is not None
+        if own and gradient_clip_val:
+            raise ValueError(
+                "gradients are clipped twice: use --trainer.gradient_clip_val null, or none of "
+                "--model.clip_norm and --model.clip_value"
+            )
+        if self.clip_norm is not None:
+            clip_grad_norm_(self.net.parameters(), self.clip_norm)
+        if self.clip_value is not None:
+            clip_grad_value_(self.net.parameters(), self.clip_value)
+        if not own:
+            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
 
     def configure_optimizers(self) -> dict[str, Any]:  # type: ignore[override]
         """Return the optimiser, with its schedule if there is one."""
