@@ -264,8 +264,8 @@ class Layer(_Sampled):
         def spread(embedding: Tensor, context: Tensor, values: Tensor) -> Tensor:
             logits = wide(generator.joint(embedding, context)[:, :, :taps])
             shift = source_maximum(logits).expand(values[:, :, :1].shape)
-            each = (part.flatten(0, 1)[:, None] for part in (values, logits, shift))
-            return _rows(*each, radius).reshape(*values.shape[:3], -1, values.shape[-1])
+            each = [part.flatten(0, 1)[:, None] for part in (values, logits, shift)]
+            return _rows(each[0], each[1], each[2], radius).reshape(*values.shape[:3], -1, values.shape[-1])
 
         numbers = values.shape[0] * values.shape[1] * (taps + self.context)
         tensors = [layers.embedding, context, values]

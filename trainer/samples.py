@@ -114,11 +114,11 @@ def layers_of(model: Layer, buffers: dict[str, Tensor], memory: int) -> LayerIma
         made: Layered = model.layered({SAMPLES: part, **numbers})
         if not whole:
             whole = [image.new_empty(*image.shape[:-2], *size) for image in made]
-        inner = tuple(
+        rows, columns = (
             slice(c.start - r.start, c.stop - r.start) for c, r in zip(piece.core, piece.read, strict=True)
         )
         for target, image in zip(whole, made, strict=True):
-            target[(..., *piece.core)] = image[(..., *inner)]
+            target[(..., *piece.core)] = image[..., rows, columns]
     found = [_array(image[0, ..., :height, :width]) for image in whole]
     return LayerImages(found[0], found[1], found[2][..., 0], found[3])
 
