@@ -14,6 +14,7 @@ from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
+from models.sbmc import SBMC
 from models.wskp import WSKP
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "KPCN",
     "NFOR",
     "NLM",
+    "SBMC",
     "WSKP",
     "CrossBilateral",
     "JointBilateral",

@@ -3,8 +3,8 @@
     out(p) = sum_{n,q} exp(logit_q(n, p - q)) values(n, p - q) / (sum_{n,q} exp(logit_q(n, p - q)) + eps)
 
 Source: the splat of Gharbi et al. 2019 (doi:10.1145/3306346.3322954), section 4.3. The largest logit that has
-reached a pixel is kept beside the sums; whenever a sample brings a larger one the sums are scaled down, so the
-result is that of all samples at once, and nothing that grows with their number is kept. The gather of the
+reached a pixel is kept beside the sums. Whenever a sample brings a larger one the sums are scaled down, so
+the result is that of all samples at once, and nothing that grows with their number is kept. The gather of the
 paper's ablation, where pixels choose among their neighbours instead, is accumulated in the same way.
 """
 
@@ -13,11 +13,12 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops import kernel_graph as graph
 from models.ops.boxes import exporting
-from models.ops.gather import gather
+from models.ops.gather import gather_padded
 from models.ops.kernel_blocks import arriving_maximum
 from models.ops.precision import wide
 from models.ops.splat import splat_shifted
@@ -26,6 +27,9 @@ Outside = Literal["weigh", "drop"]
 """Offsets from outside the image: they take weight with logit 0 and value 0 (SBMC), or do not exist."""
 
 EPSILON = 1e-8
+
+_HIGH = 60.0
+"""Where there is nothing outside, exp of this stays finite and is multiplied by 0."""
 
 _NEVER = -1e4
 """A logit that never matters, for graphs that cannot hold an infinity."""
@@ -65,64 +69,75 @@ def splat_softmax(values: Tensor, logits: Tensor, size: int, outside: Outside = 
     Raises:
         ValueError: K is even, there are not K * K logits, or sizes differ.
     """
-    return add_splat(None, values, logits, size, outside).mean()
+    sums = splatted(values, logits, size)
+    if outside == "weigh":
+        sums = with_outside(sums, size, values.shape[1])
+    return sums.mean()
 
 
-def add_splat(
-    before: Arrivals | None, values: Tensor, logits: Tensor, size: int, outside: Outside = "weigh"
-) -> Arrivals:
-    """Add samples to the sums; see `splat_softmax`.
+def splatted(values: Tensor, logits: Tensor, size: int, beyond: bool = False) -> Arrivals:
+    """Return what some samples bring to every pixel; nothing comes from outside.
 
     Args:
-        before: Sums so far, None at the first samples.
-        values: (B, N, C, H, W), usually N = 1.
+        values: (B, N, C, H, W).
         logits: (B, N, K * K, H, W).
         size: K, odd.
-        outside: The same in every call.
+        beyond: Return H + K - 1 rows: also those above and below the image that are reached.
     """
-    beyond = _beyond(logits, size) if outside == "weigh" else None
-    maximum = _maximum(logits.detach(), size, beyond)
-    if before is not None:
-        maximum = torch.maximum(maximum, before.maximum)
-    sums = splat_shifted(values, logits, size, maximum)
-    weight = sums.weight
-    if beyond is not None:
-        weight = weight + logits.shape[1] * beyond * torch.exp(-maximum)
-    return _joined(before, Arrivals(sums.total, weight, maximum))
+    if exporting():
+        outside = F.pad(logits, (0, 0, size // 2, size // 2), value=_NEVER) if beyond else logits
+        maximum = graph.arriving_maximum(wide(outside), size, _NEVER)
+    else:
+        maximum = wide(arriving_maximum(logits.detach(), size, beyond))
+    return Arrivals(*splat_shifted(values, logits, size, maximum, beyond), maximum)
 
 
-def add_gather(before: Arrivals | None, values: Tensor, logits: Tensor, size: int) -> Arrivals:
-    """Add one sample, of which every pixel gathers with its own kernel; outside the image is black.
+def gathered(values: Tensor, logits: Tensor, size: int) -> Arrivals:
+    """Return what one sample contributes where every pixel gathers with its own kernel.
 
     Args:
-        before: Sums so far, None at the first sample.
-        values: (B, C, H, W).
+        values: (B, C, H + K - 1, W + K - 1), with what lies around the image.
         logits: (B, K * K, H, W), in the order of `models.ops.gather`.
         size: K, odd.
     """
     level = torch.logsumexp(wide(logits), 1, keepdim=True)
-    maximum = level.detach() if before is None else torch.maximum(level.detach(), before.maximum)
+    maximum = wide(logits.detach().amax(1, keepdim=True))
     weight = torch.exp(level - maximum)
-    return _joined(before, Arrivals(gather(values, logits, size, "zero") * weight, weight, maximum))
+    return Arrivals(gather_padded(values, logits, size) * weight, weight, maximum)
 
 
-def _joined(before: Arrivals | None, now: Arrivals) -> Arrivals:
-    if before is None:
-        return now
-    scale = torch.exp(before.maximum - now.maximum)
-    return Arrivals(before.total * scale + now.total, before.weight * scale + now.weight, now.maximum)
+def merge(one: Arrivals, other: Arrivals) -> Arrivals:
+    """Return the sums of both."""
+    maximum = torch.maximum(one.maximum, other.maximum)
+    first, second = torch.exp(one.maximum - maximum), torch.exp(other.maximum - maximum)
+    total = one.total * first + other.total * second
+    return Arrivals(total, one.weight * first + other.weight * second, maximum)
 
 
-def _maximum(logits: Tensor, size: int, beyond: Tensor | None) -> Tensor:
-    if exporting():
-        return graph.arriving_maximum(wide(logits), size, _NEVER if beyond is None else 0.0)
-    largest = wide(arriving_maximum(logits, size))
-    return largest if beyond is None else torch.where(beyond > 0, largest.clamp_min(0.0), largest)
+def together(parts: Arrivals) -> Arrivals:
+    """Return the sums over samples whose sums are apart, (B, N, …, H, W)."""
+    maximum = parts.maximum.amax(1)
+    scale = torch.exp(parts.maximum - maximum[:, None])
+    return Arrivals((parts.total * scale).sum(1), (parts.weight * scale).sum(1), maximum)
 
 
-def _beyond(logits: Tensor, size: int) -> Tensor:
-    """Return how many of a pixel's K * K neighbours lie outside the image, (1, 1, H, W)."""
-    image = wide(torch.ones_like(logits[:1, :1, 0]))
+def with_outside(sums: Arrivals, size: int, samples: int) -> Arrivals:
+    """Return sums to which all that is outside adds weight exp(0) for every offset and sample, and no value.
+
+    Args:
+        sums: Of all samples.
+        size: K, odd.
+        samples: Their number.
+    """
+    count = samples * _outside_count(sums.weight, size)
+    maximum = torch.where(count > 0, sums.maximum.clamp_min(0.0), sums.maximum)
+    scale = torch.exp(sums.maximum - maximum)
+    weight = sums.weight * scale + count * torch.exp(-maximum.clamp_min(-_HIGH))
+    return Arrivals(sums.total * scale, weight, maximum)
+
+
+def _outside_count(image: Tensor, size: int) -> Tensor:
+    """Return how many of each pixel's K * K neighbours lie outside images (B, 1, H, W)."""
     if exporting():
         return graph.outside_count(image, size)
     inside = []

@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 _CHUNK = 1 << 17
-"""Numbers of a block on a CPU. A scatter of three channels keeps five blocks, 2.6 MB of cache on two cores."""
+"""Numbers of a block on a CPU. Three channels need five blocks, 2.6 MB, shared by the caches of the cores."""
 
 _CHUNK_DEVICE = 1 << 24
 """The same on other devices, where calls cost more and memory less."""
@@ -47,8 +47,9 @@ class Kernels:
         size: K, odd.
         dtype: What weights are computed in.
         source: Subtracted before exp at the pixel that owns the kernel, (B, N, 1, H, W).
-        target: Subtracted before exp at the pixel that is reached, (B, 1, H, W); offsets that leave the image
-            get weight 0, whatever their numbers. Without any shift the numbers are the weights.
+        target: Subtracted before exp at the pixel that is reached, (B, 1, H + 2 m, W), m as below; offsets
+            that leave the image get weight 0, whatever their numbers. Without any shift the numbers are the
+            weights.
     """
 
     numbers: Tensor
@@ -67,11 +68,17 @@ class Kernels:
         """Whether weights are exponentials of the numbers."""
         return self.source is not None or self.target is not None
 
+    def margin(self, beyond: bool) -> int:
+        """Return m, the rows above and below the image that count: those that are reached, or none."""
+        return self.radius if beyond else 0
+
     def images(self) -> Iterator[tuple[int, int, Kernels]]:
         """Return b, n and the kernels of that image alone, (K * K, H, W)."""
         for b in range(self.numbers.shape[0]):
             # Offsets that leave the image meet an infinite shift: no weight.
-            target = None if self.target is None else _padded(self.target[b], self.radius, torch.inf)
+            target = None
+            if self.target is not None:
+                target = _padded(self.target[b], self.radius, self.numbers.shape[-2], torch.inf)
             for n in range(self.numbers.shape[1]):
                 source = None if self.source is None else self.source[b, n]
                 yield b, n, Kernels(self.numbers[b, n], self.size, self.dtype, source, target)
@@ -96,13 +103,23 @@ def windows(padded: Tensor, width: int) -> Tensor:
     return padded.unfold(2, width, 1).transpose(1, 2)
 
 
-def scatter(kernels: Kernels, values: Tensor) -> Tensor:
-    """Send the values (B, N, C, H, W) to the pixels around; return sums (B, C + 1, H, W), last of weights."""
+def scatter(kernels: Kernels, values: Tensor, beyond: bool = False) -> Tensor:
+    """Send values to the pixels around.
+
+    Args:
+        kernels: B x N images of them.
+        values: (B, N, C, H, W).
+        beyond: Also return the r rows above and below the image that are reached.
+
+    Returns:
+        Sums over n, (B, C + 1, H or H + 2 r, W), in the last channel of weights.
+    """
     batch, _, channels, height, width = values.shape
-    out = values.new_zeros(batch, channels + 1, height, width)
+    margin = kernels.margin(beyond)
+    out = values.new_zeros(batch, channels + 1, height + 2 * margin, width)
     for b, n, one in kernels.images():
-        for rows in strips(height, width, kernels.size, values):
-            _scatter_strip(one, rows, values[b, n], out[b, :, rows])
+        for rows in strips(height + 2 * margin, width, kernels.size, values):
+            _scatter_strip(one, rows, margin, values[b, n], out[b, :, rows])
     return out
 
 
@@ -111,7 +128,7 @@ def collect(kernels: Kernels, image: Tensor) -> Tensor:
     out = torch.empty_like(image)
     width = image.shape[-1]
     for b, n, one in kernels.images():
-        shifted = windows(_padded(image[b, n], kernels.radius), width)
+        shifted = windows(_padded(image[b, n], kernels.radius, image.shape[-2]), width)
         for rows in strips(image.shape[-2], width, kernels.size, image):
             weights = _block(one, rows, width)
             sums = weights.new_zeros(image.shape[2], *weights.shape)
@@ -129,8 +146,8 @@ def slopes(kernels: Kernels, own: Tensor, other: Tensor, wanted: tuple[bool, boo
     Args:
         kernels: B x N images of them.
         own: (B, N, C, H, W), at the pixels that own the kernels.
-        other: (B, N or 1, C or C + 1, H, W), at those that are reached; a last channel that `own` does not
-            have meets 1.
+        other: (B, N or 1, C or C + 1, H or H + 2 r, W), at those that are reached; a last channel that `own`
+            does not have meets 1.
         wanted: Which of own, numbers and source shift.
     """
     numbers = kernels.numbers
@@ -138,22 +155,34 @@ def slopes(kernels: Kernels, own: Tensor, other: Tensor, wanted: tuple[bool, boo
     d_numbers = numbers.new_empty(numbers.shape) if wanted[1] else None
     d_source = own.new_zeros(own[:, :, :1].shape) if wanted[2] else None
     for b, n, one in kernels.images():
-        shifted = windows(_padded(other[b, n % other.shape[1]], kernels.radius), own.shape[-1])
+        reached = _padded(other[b, n % other.shape[1]], kernels.radius, own.shape[-2])
+        shifted = windows(reached, own.shape[-1])
         for rows in strips(own.shape[-2], own.shape[-1], kernels.size, own):
             parts = Slopes(*(None if d is None else d[b, n, :, rows] for d in (d_own, d_numbers, d_source)))
             _slopes_strip(one, rows, own[b, n, :, rows], shifted, parts)
     return Slopes(d_own, d_numbers, d_source)
 
 
-def arriving_maximum(numbers: Tensor, size: int) -> Tensor:
-    """Return the largest number that reaches each pixel (B, 1, H, W), from numbers (B, N, K * K, H, W)."""
+def arriving_maximum(numbers: Tensor, size: int, beyond: bool = False) -> Tensor:
+    """Return the largest number that reaches each pixel.
+
+    Args:
+        numbers: (B, N, K * K, H, W).
+        size: K, odd.
+        beyond: As in `scatter`.
+
+    Returns:
+        (B, 1, H or H + 2 r, W).
+    """
     batch, _, _, height, width = numbers.shape
-    out = numbers.new_full((batch, 1, height, width), -torch.inf)
-    for b, _, one in Kernels(numbers, size, numbers.dtype).images():
-        for rows in strips(height, width, size, numbers):
+    kernels = Kernels(numbers, size, numbers.dtype)
+    margin = kernels.margin(beyond)
+    out = numbers.new_full((batch, 1, height + 2 * margin, width), -torch.inf)
+    for b, _, one in kernels.images():
+        for rows in strips(height + 2 * margin, width, size, numbers):
             buffer = _gutters(one, rows, width, 1, -torch.inf)
             largest = buffer[0, :, :, one.radius : one.radius + width]
-            for dy, source, part in _arriving(one, rows, height):
+            for dy, source, part in _arriving(one, rows, margin, height):
                 taps = one.numbers[dy * size : (dy + 1) * size, source]
                 torch.maximum(largest[:, part], taps, out=largest[:, part])
             out[b, :, rows] = torch.maximum(out[b, :, rows], _aligned(buffer, width).amax(1))
@@ -167,13 +196,13 @@ def strips(height: int, width: int, size: int, like: Tensor) -> Iterator[slice]:
     return (slice(first, min(height, first + rows)) for first in range(0, height, rows))
 
 
-def _scatter_strip(kernels: Kernels, rows: slice, values: Tensor, out: Tensor) -> None:
-    """Add what reaches some rows, from values (C, H, W), to out (C + 1, rows, W)."""
+def _scatter_strip(kernels: Kernels, rows: slice, margin: int, values: Tensor, out: Tensor) -> None:
+    """Add what reaches some rows to out (C + 1, rows, W), from values (C, H, W); row 0 is `margin` above."""
     channels, height, width = values.shape
     buffer = _gutters(kernels, rows, width, channels + 1, 0.0)
     sums = buffer[..., kernels.radius : kernels.radius + width]
     weights = _block(kernels, rows, width)
-    for dy, source, part in _arriving(kernels, rows, height):
+    for dy, source, part in _arriving(kernels, rows, margin, height):
         block = weights.flatten()[: weights[:, part].numel()].view(
             kernels.size, -1, width
         )  # contiguous: exp is fast
@@ -220,13 +249,13 @@ def _products(own: Tensor, seen: Tensor, out: Tensor) -> None:
         out.addcmul_(seen[channel], own[channel])
 
 
-def _arriving(kernels: Kernels, rows: slice, height: int) -> Iterator[tuple[int, slice, slice]]:
+def _arriving(kernels: Kernels, rows: slice, margin: int, height: int) -> Iterator[tuple[int, slice, slice]]:
     """Return, for every row of taps, the rows that send to `rows` and where among these they arrive."""
     for dy in range(kernels.size):
-        below = dy - kernels.radius
-        first, last = max(rows.start - below, 0), min(rows.stop - below, height)
+        start = rows.start - margin - (dy - kernels.radius)
+        first, last = max(start, 0), min(start + rows.stop - rows.start, height)
         if first < last:
-            yield dy, slice(first, last), slice(first + below - rows.start, last + below - rows.start)
+            yield dy, slice(first, last), slice(first - start, last - start)
 
 
 def _block(kernels: Kernels, rows: slice, width: int) -> Tensor:
@@ -249,5 +278,7 @@ def _aligned(buffer: Tensor, width: int) -> Tensor:
     return buffer.as_strided((channels, taps, rows, width), strides, buffer.storage_offset() + taps - 1)
 
 
-def _padded(image: Tensor, reach: int, value: float = 0.0) -> Tensor:
-    return F.pad(image, [reach] * 4, value=value)
+def _padded(image: Tensor, reach: int, height: int, value: float = 0.0) -> Tensor:
+    """Return an image (C, H or H + 2 r, W) with a border of r pixels on each side."""
+    rows = reach - (image.shape[-2] - height) // 2
+    return F.pad(image, [reach, reach, rows, rows], value=value)

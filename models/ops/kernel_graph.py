@@ -33,6 +33,15 @@ def scatter(values: Tensor, kernels: Tensor, size: int) -> Tensor:
     return torch.cat(sums, 1)
 
 
+def extended(
+    values: Tensor, numbers: Tensor, source: Tensor | None, size: int, exponential: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return values, numbers and shift with r more rows above and below, which send nothing."""
+    margin = (0, 0, size // 2, size // 2)
+    shift = None if source is None else F.pad(source, margin)
+    return F.pad(values, margin), F.pad(numbers, margin, value=-_FAR if exponential else 0.0), shift
+
+
 def collect(image: Tensor, kernels: Tensor, size: int) -> Tensor:
     """Return the sums (B, N, C, H, W) of images (B, N, C, H, W)."""
     flat, owned = image.flatten(0, 1), kernels.flatten(0, 1)

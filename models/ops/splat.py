@@ -11,7 +11,7 @@ Munkberg and Hasselgren 2020 (doi:10.1111/cgf.14049) subtract the largest logit 
 softmax over all contributions of a pixel: `models.ops.arrivals`.
 
 Everything runs in float32, or float64 for float64 values, also under mixed precision, is differentiable once
-and keeps logits and values only: weights are computed again in the backward pass (`models.ops.kernel_blocks`).
+and keeps logits and values only: the backward pass computes weights again (`models.ops.kernel_blocks`).
 Memory beyond inputs, outputs and gradients does not grow with the kernels.
 """
 
@@ -41,7 +41,7 @@ class Splatted(NamedTuple):
     weight: Tensor
 
 
-def splat(values: Tensor, weights: Tensor, size: int) -> Splatted:
+def splat(values: Tensor, weights: Tensor, size: int, beyond: bool = False) -> Splatted:
     """Splat values with given weights; the adjoint of `gather_weighted`.
 
     Args:
@@ -49,14 +49,18 @@ def splat(values: Tensor, weights: Tensor, size: int) -> Splatted:
         weights: (B, N, K * K, H, W); map `K * (dy + r) + dx + r` weighs what goes to the pixel dy rows below
             and dx columns to the right, r = (K - 1) / 2.
         size: K, odd.
+        beyond: Return H + K - 1 rows: also the r rows above and below the image that are reached, for images
+            that are parts of another.
 
     Raises:
         ValueError: K is even, there are not K * K weights, or sizes differ.
     """
-    return _splatted(values, weights, size)
+    return _splatted(values, weights, _Shifts(), size, beyond)
 
 
-def splat_exp(values: Tensor, logits: Tensor, size: int, shift: Tensor | None = None) -> Splatted:
+def splat_exp(
+    values: Tensor, logits: Tensor, size: int, shift: Tensor | None = None, beyond: bool = False
+) -> Splatted:
     """Splat values with weights exp(logit - shift), the shift being that of the pixel that splats.
 
     Args:
@@ -66,29 +70,33 @@ def splat_exp(values: Tensor, logits: Tensor, size: int, shift: Tensor | None = 
         shift: (B, 1 or N, 1, H, W). None: the largest logit of the pixel over all taps and all N, so that
             the largest weight is 1. Where samples come one at a time it is their common maximum. It has a
             gradient, since the result is no function of differences alone.
+        beyond: As in `splat`.
 
     Raises:
         ValueError: As for `splat`, or the shift has another shape.
     """
     if shift is None and not exporting():
         _check(values, logits, size)
-        return _splatted(values, logits, size, *_largest(logits.detach(), size))
-    return _splatted(values, logits, size, source_maximum(logits) if shift is None else shift)
+        return _splatted(values, logits, _largest(logits.detach(), size), size, beyond)
+    shift = source_maximum(logits) if shift is None else shift
+    return _splatted(values, logits, _Shifts(shift), size, beyond)
 
 
-def splat_shifted(values: Tensor, logits: Tensor, size: int, shift: Tensor) -> Splatted:
+def splat_shifted(values: Tensor, logits: Tensor, size: int, shift: Tensor, beyond: bool = False) -> Splatted:
     """Splat values with weights exp(logit - shift), the shift being that of the pixel that is reached.
 
     Args:
         values: (B, N, C, H, W), of N samples or layers.
         logits: (B, N, K * K, H, W), in the order of `splat`.
         size: K, odd.
-        shift: (B, 1, H, W), a constant for the gradient; at least about the largest logit that arrives.
+        shift: (B, 1, H, W), or H + K - 1 rows with `beyond`; a constant for the gradient, at least about the
+            largest logit that arrives.
+        beyond: As in `splat`.
 
     Raises:
         ValueError: As for `splat_exp`.
     """
-    return _splatted(values, logits, size, target=shift.detach())
+    return _splatted(values, logits, _Shifts(target=shift.detach()), size, beyond)
 
 
 def source_maximum(logits: Tensor) -> Tensor:
@@ -155,41 +163,47 @@ def _inside_maximum(logits: Tensor, size: int, dtype: torch.dtype) -> Tensor:
     return out
 
 
-def _splatted(
-    values: Tensor,
-    numbers: Tensor,
-    size: int,
-    source: Tensor | None = None,
-    index: Tensor | None = None,
-    target: Tensor | None = None,
-) -> Splatted:
+class _Shifts(NamedTuple):
+    """What is subtracted from logits: at the pixel that splats, with its place among the N * K * K logits
+    where it is one of them, and at the pixel that is reached."""
+
+    source: Tensor | None = None
+    place: Tensor | None = None
+    target: Tensor | None = None
+
+
+def _splatted(values: Tensor, numbers: Tensor, shifts: _Shifts, size: int, beyond: bool) -> Splatted:
     values = wide(values)
     if not exporting():
         _check(values, numbers, size)
+    source, index, target = shifts
     if source is not None:
         source = source.to(values.dtype).expand(values[:, :, :1].shape)
     if target is not None:
         target = target.to(values.dtype)
     if exporting():
+        if beyond:
+            shifted = source is not None or target is not None
+            values, numbers, source = graph.extended(values, numbers, source, size, shifted)
         sums = graph.scatter(values, graph.weights(numbers.to(values.dtype), size, source, target), size)
     elif torch.is_grad_enabled() and any(
         t is not None and t.requires_grad for t in (values, numbers, source)
     ):
-        sums = _Splat.apply(values, numbers, source, target, index, size)
+        sums = _Splat.apply(values, numbers, source, target, index, size, beyond)
     else:
-        sums = scatter(Kernels(numbers, size, values.dtype, source, target), values)
+        sums = scatter(Kernels(numbers, size, values.dtype, source, target), values, beyond)
     return Splatted(sums[:, :-1], sums[:, -1:])
 
 
-def _largest(logits: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return `source_maximum` and which of all N * K * K logits it is, (B, 1, H, W).
+def _largest(logits: Tensor, size: int) -> _Shifts:
+    """Return `source_maximum` and which logit it is, (B, 1, H, W).
 
     The largest of each row of taps first: finding places costs 40 times as much as finding values.
     """
     lines = logits.reshape(len(logits), -1, size, *logits.shape[3:])
     largest, line = lines.amax(2).max(1, keepdim=True)
     taps = torch.gather(lines, 1, line[:, :, None].expand(-1, -1, size, -1, -1))[:, 0]
-    return largest[:, None], line * size + taps.argmax(1, keepdim=True)
+    return _Shifts(largest[:, None], line * size + taps.argmax(1, keepdim=True))
 
 
 def _gathered(image: Tensor, numbers: Tensor, size: int, source: Tensor | None = None) -> Tensor:
@@ -214,8 +228,8 @@ def _check(values: Tensor, numbers: Tensor, size: int) -> None:
     expected = (batch, count, size * size, height, width)
     if tuple(numbers.shape) != expected:
         raise ValueError(
-            f"weights or logits of {size}x{size} kernels have shape {tuple(numbers.shape)}, expected {expected} "
-            f"for values of shape {tuple(values.shape)}"
+            f"weights or logits of {size}x{size} kernels have shape {tuple(numbers.shape)}, expected "
+            f"{expected} for values of shape {tuple(values.shape)}"
         )
 
 
@@ -237,10 +251,11 @@ class _Splat(torch.autograd.Function):
         target: Tensor | None,
         index: Tensor | None,
         size: int,
+        beyond: bool,
     ) -> Tensor:
         ctx.save_for_backward(values, numbers, source, target, index)
         ctx.size = size
-        return scatter(Kernels(numbers, size, values.dtype, source, target), values)
+        return scatter(Kernels(numbers, size, values.dtype, source, target), values, beyond)
 
     @staticmethod
     @once_differentiable
@@ -254,7 +269,7 @@ class _Splat(torch.autograd.Function):
             # The shift is one of the logits: its gradient goes there.
             change = d_source.sum(1).to(d_numbers.dtype)
             d_numbers.view(len(change), -1, *change.shape[-2:]).scatter_add_(1, index, change)
-        return d_values, d_numbers, d_source if for_source else None, None, None, None
+        return d_values, d_numbers, d_source if for_source else None, None, None, None, None
 
 
 class _Gather(torch.autograd.Function):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 import models
 from data.buffers import BUFFERS, FRAME_NUMBERS, SAMPLE_BUFFERS, SAMPLES, buffer
+from models.blocks.per_sample import PerSample
 from models.denoiser import Denoiser, select
 from models.tiling import denoise_tiled
 from tests.models.frames import largest_relative, lit, luminous, sampled, split_buffers
@@ -18,14 +19,14 @@ from tests.models.frames import largest_relative, lit, luminous, sampled, split_
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
-KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral", *LAYERS}
+KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral", "SBMC", *LAYERS}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
-CLEANING = {"ACFM", "AFGSA", "KPCN", *LAYERS}
+CLEANING = {"ACFM", "AFGSA", "KPCN", "SBMC", *LAYERS}
 """Methods that take radiance which is negative, infinite or not a number; the data module repairs it for the
 others."""
 
-DECIDE = {"NFOR", "JointNLM", *LAYERS}
+DECIDE = {"NFOR", "JointNLM", "SBMC", *LAYERS}
 """Methods that choose, between candidates or by an extremum: gradients reach less far than values."""
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -36,6 +37,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "NLM": {"window": 2, "patch": 1},
     "JointNLM": {"window": 2, "patch": 1, "prefilter_window": 1},
     "MultiScaleNLM": {"window": 2, "patch": 1},
+    "SBMC": {"features": PerSample.samples, "width": 4, "levels": 2, "rounds": 2, "kernel_size": 5},
     **{key: {"width": 4, "levels": 3, "kernel_size": 5, "embedding": 8} for key in LAYERS},
 }
 """Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models.ops import kernel_blocks
-from models.ops.arrivals import Arrivals, Outside, add_gather, add_splat, splat_softmax
+from models.ops.arrivals import Outside, gathered, merge, splat_softmax, splatted, with_outside
+from models.ops.gather import pad_border
 from tests.models.ops.test_splat import close, made
 from tests.models.plain_splat import plain_gather_samples, plain_splat_softmax
 
@@ -18,11 +22,12 @@ def chunk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def one_by_one(values: Tensor, logits: Tensor, size: int, outside: Outside = "weigh") -> Tensor:
-    sums: Arrivals | None = None
-    for n in range(values.shape[1]):
-        sums = add_splat(sums, values[:, n : n + 1], logits[:, n : n + 1], size, outside)
-    assert sums is not None
-    return sums.mean()
+    parts = [
+        splatted(v[:, None], w[:, None], size)
+        for v, w in zip(values.unbind(1), logits.unbind(1), strict=True)
+    ]
+    sums = reduce(merge, parts)
+    return (with_outside(sums, size, len(parts)) if outside == "weigh" else sums).mean()
 
 
 @pytest.mark.usefixtures("chunk")
@@ -51,6 +56,14 @@ def test_gradients_of_samples_at_once_and_one_by_one_are_those_of_finite_differe
     assert torch.autograd.gradcheck(lambda v, w: one_by_one(v, w, 3, outside), (values, logits))
 
 
+@pytest.mark.parametrize("size", [3, 5])
+def test_rows_beyond_the_image_are_those_of_a_taller_image_that_sends_nothing_from_them(size: int) -> None:
+    values, logits = made(size)
+    margin = (0, 0, size // 2, size // 2)
+    taller = splatted(F.pad(values, margin), F.pad(logits, margin, value=-1e4), size)
+    close(splatted(values, logits, size, beyond=True), taller)
+
+
 def test_a_constant_stays_constant_unless_what_lies_outside_takes_weight() -> None:
     values, logits = made(5, 12, 12)
     values = torch.full_like(values, 3.0)
@@ -63,10 +76,10 @@ def test_a_constant_stays_constant_unless_what_lies_outside_takes_weight() -> No
 @pytest.mark.parametrize("size", [1, 5])
 def test_gathers_of_samples_are_one_softmax_over_samples_and_neighbours(size: int) -> None:
     values, logits = (t.requires_grad_() for t in made(size))
-    sums: Arrivals | None = None
-    for n in range(3):
-        sums = add_gather(sums, values[:, n], logits[:, n] * 30, size)
-    assert sums is not None
+    sums = reduce(
+        merge,
+        [gathered(pad_border(values[:, n], size // 2, "zero"), logits[:, n] * 30, size) for n in range(3)],
+    )
     expected = plain_gather_samples(values, logits * 30, size)
     torch.testing.assert_close(sums.mean(0.0), expected)
     weights = torch.rand_like(expected)
@@ -76,8 +89,9 @@ def test_gathers_of_samples_are_one_softmax_over_samples_and_neighbours(size: in
 
 class Traced(nn.Module):
     def forward(self, values: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
-        gathered = add_gather(None, values[:, 0], logits[:, 0], 5).mean()
-        return splat_softmax(values, logits, 5), splat_softmax(values, logits, 5, "drop"), gathered
+        own = gathered(pad_border(values[:, 0], 2, "zero"), logits[:, 0], 5).mean()
+        beyond = splatted(values, logits, 5, beyond=True).mean()
+        return splat_softmax(values, logits, 5), splat_softmax(values, logits, 5, "drop"), own, beyond
 
 
 def test_a_traced_softmax_runs_at_another_size_and_number_of_samples() -> None:

@@ -1,9 +1,10 @@
-"""Splats equal the loop over samples, pixels and offsets, in values and gradients, and are gathers' adjoints."""
+"""Splats equal the loop over samples, pixels and offsets, with their gradients, and are gathers' adjoints."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models.ops import kernel_blocks
@@ -69,6 +70,28 @@ def test_one_pixel_by_hand() -> None:
     assert found.weight[0, 0].tolist() == [[0, 0.5, 0], [0.25, 0, 0], [0, 0, 0]]
 
 
+@pytest.mark.usefixtures("chunk")
+def test_rows_beyond_the_image_are_those_of_a_taller_image_in_values_and_gradients() -> None:
+    values, logits = (t.requires_grad_() for t in made(5))
+    margin = (0, 0, 2, 2)
+    shift = torch.rand(2, 1, 10, 7, dtype=torch.float64)
+    own = logits.amax((1, 2), keepdim=True)
+    tall = [F.pad(values, margin), F.pad(logits, margin, value=-100.0), F.pad(own, margin)]
+    pairs = [
+        (splat(values, logits, 5, beyond=True), splat(tall[0], F.pad(logits, margin), 5)),
+        (splat_exp(values, logits, 5, beyond=True), splat_exp(*tall[:2], 5, tall[2])),
+        (splat_shifted(values, logits, 5, shift, True), splat_shifted(*tall[:2], 5, shift)),
+    ]
+    for found, expected in pairs:
+        close(found, expected)
+        close(
+            *(
+                torch.autograd.grad(loss(made), (values, logits), retain_graph=True)
+                for made in (found, expected)
+            )
+        )
+
+
 @pytest.mark.parametrize("size", [1, 3, 17])
 def test_splat_and_gather_are_adjoint(size: int) -> None:
     values, weights = made(size, 9, 22, count=1)
@@ -90,7 +113,7 @@ def test_gathering_inside_is_a_softmax_over_the_offsets_that_stay_in_the_image()
     values, logits = made(5, 7, 6, count=1)
     logits[:, 0, 0] = 2000.0  # outside for the first two rows and columns; exp of it overflows
     image, inside = values[:, 0], torch.ones_like(values[:, 0, :1])
-    unfolded = nn.functional.unfold(inside, 5, padding=2).reshape(2, 25, 7, 6)
+    unfolded = F.unfold(inside, 5, padding=2).reshape(2, 25, 7, 6)
     weights = logits[:, 0].masked_fill(unfolded == 0, -torch.inf).softmax(1)
     found = gather_inside(image, logits[:, 0], 5)
     torch.testing.assert_close(found, fold_gather(image, weights, 5))
@@ -198,8 +221,8 @@ def test_kernels_in_another_memory_format_give_the_same() -> None:
 
 def test_memory_beyond_inputs_and_gradients_is_a_small_part_of_the_kernels() -> None:
     values, logits = (
-        torch.rand(1, 6, 3, 64, 64).requires_grad_(),
-        torch.randn(1, 6, 289, 64, 64).requires_grad_(),
+        torch.rand(1, 3, 3, 96, 96).requires_grad_(),
+        torch.randn(1, 3, 289, 96, 96).requires_grad_(),
     )
 
     def step() -> None:
@@ -219,6 +242,8 @@ class Traced(nn.Module):
         return (
             *splat(values, logits, 5),
             *splat_exp(values, logits, 5),
+            *splat(values, logits, 5, beyond=True),
+            *splat_exp(values, logits, 5, beyond=True),
             *splat_shifted(values, logits, 5, shift),
             gather_weighted(image, own, 5),
             gather_inside(image, own, 5),
