@@ -9,18 +9,22 @@ themselves, or exp(number - shift), where the shift belongs to the pixel that ow
 that is reached. Blocks of K taps of a strip of rows fit into the cache; no weight outlives its block.
 
 A strip of rows is reached from K other strips, one for each row of taps. Their products are added up tap by
-tap first; the K sums are brought to the columns that they go to once in the end.
+tap first; the K sums are brought to the columns that they go to once in the end. On CUDA devices with Triton
+the kernels of `models.ops.triton` do the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from models.ops import triton
 
 _CHUNK = 1 << 17
 """Numbers of a block on a CPU. Three channels need five blocks, 2.6 MB, shared by the caches of the cores."""
@@ -114,6 +118,8 @@ def scatter(kernels: Kernels, values: Tensor, beyond: bool = False) -> Tensor:
     Returns:
         Sums over n, (B, C + 1, H or H + 2 r, W), in the last channel of weights.
     """
+    if triton.usable(values):
+        return _compiled().scatter(kernels, values, beyond)
     batch, _, channels, height, width = values.shape
     margin = kernels.margin(beyond)
     out = values.new_zeros(batch, channels + 1, height + 2 * margin, width)
@@ -125,6 +131,8 @@ def scatter(kernels: Kernels, values: Tensor, beyond: bool = False) -> Tensor:
 
 def collect(kernels: Kernels, image: Tensor) -> Tensor:
     """Return the sums (B, N, C, H, W) that the kernels make of images (B, N, C, H, W), zero outside."""
+    if triton.usable(image):
+        return _compiled().collect(kernels, image)
     out = torch.empty_like(image)
     width = image.shape[-1]
     for b, n, one in kernels.images():
@@ -150,6 +158,8 @@ def slopes(kernels: Kernels, own: Tensor, other: Tensor, wanted: tuple[bool, boo
             does not have meets 1.
         wanted: Which of own, numbers and source shift.
     """
+    if triton.usable(own):
+        return Slopes(*_compiled().slopes(kernels, own, other, wanted))
     numbers = kernels.numbers
     d_own = torch.zeros_like(own) if wanted[0] else None
     d_numbers = numbers.new_empty(numbers.shape) if wanted[1] else None
@@ -194,6 +204,10 @@ def strips(height: int, width: int, size: int, like: Tensor) -> Iterator[slice]:
     limit = _CHUNK if like.device.type == "cpu" else _CHUNK_DEVICE
     rows = max(1, limit // (size * width))
     return (slice(first, min(height, first + rows)) for first in range(0, height, rows))
+
+
+def _compiled() -> Any:
+    return import_module("models.ops.triton.kernel_sums")
 
 
 def _scatter_strip(kernels: Kernels, rows: slice, margin: int, values: Tensor, out: Tensor) -> None:
