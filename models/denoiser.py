@@ -5,7 +5,7 @@ Shape letters: B batch, T frames, S samples per pixel, C channels, H rows, W col
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -22,10 +22,13 @@ class Denoised(NamedTuple):
     Attributes:
         color: Linear radiance (B, 3, H, W) in the units of the input.
         state: What a recurrent method carries to the next frame, otherwise None.
+        aux: What the method made on its way and was asked for, (B, C, H, W) with one or three channels: name
+            of a layer, or of the buffer that it is a filtered form of. Otherwise None.
     """
 
     color: Tensor
     state: Any = None
+    aux: Mapping[str, Tensor] | None = None
 
 
 class Pair(NamedTuple):
@@ -56,6 +59,9 @@ class Denoiser(nn.Module):
             padded by repeating their last row and column, in the module and in the tiler alike.
         temporal: `irradiance` (or `color`) is expected to be accumulated over the preceding frames.
         per_sample: Buffers carry a sample axis (B, S, C, H, W).
+        frames: Frames before and after a frame that one step of a space-time method looks at; 0: images.
+            Otherwise buffers are sequences (B, T, C, H, W), and `forward` returns the middle frame.
+        frame_halo: Frames on each side that the exact result of a frame depends on.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         targets: Names of the buffers that training compares with.
@@ -68,6 +74,8 @@ class Denoiser(nn.Module):
     multiple: int = 1
     temporal: bool = False
     per_sample: bool = False
+    frames: int = 0
+    frame_halo: int = 0
     bytes_per_pixel: int = 500
     bytes_once: int = 0
     targets: tuple[str, ...] = ("reference",)
@@ -83,6 +91,38 @@ class Denoiser(nn.Module):
             ValueError: A buffer is missing or has another shape (see `check`).
         """
         raise TypeError(f"{type(self).__name__} does not define forward")
+
+    def sequence(self, buffers: Buffers) -> Tensor:
+        """Denoise all frames of a sequence, for space-time methods.
+
+        Args:
+            buffers: Tensors (B, T, C, H, W) for each name of `inputs`, and optionally frame numbers.
+
+        Returns:
+            Linear radiance (B, T, 3, H, W).
+
+        Raises:
+            ValueError: A buffer is missing or has another shape.
+        """
+        raise TypeError(f"{type(self).__name__} does not denoise sequences")
+
+    def clip(self, buffers: Buffers) -> Denoised:
+        """Denoise all frames of a sequence as `sequence` does, with `aux` (B, T, C, H, W) where asked for."""
+        return Denoised(self.sequence(buffers))
+
+    def instead(self, available: Collection[str]) -> tuple[Denoiser, tuple[str, ...]] | None:
+        """Return the form of this method that does with the buffers that a frame has.
+
+        It never assumes what only the user can know, such as that a feature has no noise: that is an option
+        of the method, and `forward` says so where a buffer is missing.
+
+        Args:
+            available: Names of the buffers that there are or that can be derived.
+
+        Returns:
+            The other form and the reasons, one sentence each; None: there is none, or none is needed.
+        """
+        return None
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return the frame numbers that need the whole frame, from whole frames.

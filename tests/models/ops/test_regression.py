@@ -88,7 +88,7 @@ def test_strips_equal_the_whole() -> None:
     assert largest_relative(found, expected) < 1e-5
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [1, 2, 3])
 def test_fused_fits_equal_pytorch_on_images_of_many_tiles(threads: int) -> None:
     one = sample(35, 150, features=7)
     kernel = PatchKernel(4, 3, (0.5, 1.0), scale=2.0, channels="least")
