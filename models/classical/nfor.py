@@ -21,7 +21,7 @@ Two differences make none here. The paper scales features to [-1, 1] per window,
 the conditioning; `models.ops.regression` solves independently of units. The paper filters one selection map
 per bandwidth; filtered with the same normalised weights they add up to 1, so the map of k = 1 and its
 complement are the same. The public implementation solves by a pivoted QR factorisation in float32, this one
-by normal equations with a ridge of 1e-6. Distances are computed on radiance times `exposure`, since their
+by normal equations with a ridge of 5e-7. Distances are computed on radiance times `exposure`, since their
 small constant (1e-7) has the units of a variance; where no exposure is given that is the public behaviour.
 
 Without halves of the colour (`color_noise` = `variance` or `estimated`) no independent half is there to take

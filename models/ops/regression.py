@@ -32,7 +32,7 @@ from torch import Tensor
 from models.ops.boxes import exporting
 from models.ops.nlm import Guide, Offset, PatchKernel, PatchWeights, guide_parts, strips, use_fused
 
-RIDGE = 1e-6
+RIDGE = 5e-7
 NOISE = 2e-6
 _TOGETHER = 16
 """Offsets whose products are added in the precision of the images before float64 takes over: added one by

@@ -86,14 +86,15 @@ def picture(found: Growth, path: Path) -> None:
 
     figure, axes = plt.subplots(2, len(found), figsize=(10.5, 5.4), sharex="col", sharey="row", squeeze=False)
     labels = {"megapixels": "megapixels", "window radius": "window radius", "features": "scalar features"}
+    drawn: tuple[list[float], list[float]] = ([], [])
     for column, (what, costs) in enumerate(found.items()):
         values = list(costs)
         time = [cost.processor / cost.pixels * 1e6 for cost in costs.values()]
         memory = [cost.memory / cost.pixels for cost in costs.values()]
         for line, numbers in enumerate((time, memory)):
+            drawn[line] += numbers
             panel = axes[line][column]
             panel.plot(values, numbers, marker="o", color=("tab:blue", "tab:orange")[line], clip_on=False)
-            panel.set_ylim(bottom=0)
             panel.grid(alpha=0.3)
             for value, number in zip(values, numbers, strict=True):
                 panel.annotate(
@@ -103,11 +104,10 @@ def picture(found: Growth, path: Path) -> None:
             axes[0][column].set_xscale("log", base=4)
         axes[1][column].set_xticks(values, [f"{value:g}" for value in values], minor=False)
         axes[1][column].set_xlabel(labels[what])
-    axes[0][0].set_ylabel("processor µs per pixel")
-    axes[1][0].set_ylabel("bytes per pixel beside the frame")
-    for panels in axes:
-        top = panels[0].get_ylim()[1]
-        panels[0].set_ylim(0, 1.15 * top)
+    axes[0][0].set_ylabel("processor time,\nµs per pixel")
+    axes[1][0].set_ylabel("bytes per pixel\nbeside the frame")
+    for panels, numbers in zip(axes, drawn, strict=True):
+        panels[0].set_ylim(0, 1.2 * max(numbers))
     figure.suptitle("NFOR, compiled kernels, two threads")
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -71,6 +71,19 @@ def test_what_is_linear_in_position_and_features_is_reproduced(fused: bool) -> N
 
 
 @pytest.mark.parametrize("fused", [False, True])
+def test_features_that_hardly_differ_are_told_apart_in_windows_of_361_similar_pixels(fused: bool) -> None:
+    one = sample(24, 32, features=2)
+    nearly = one.features[:, :1] + 3e-3 * one.features[:, 1:]
+    features = torch.cat([one.features[:, :1], nearly], 1)
+    guide = Guide(one.guide[0], torch.full_like(one.guide[1], 0.3))
+    kernel = PatchKernel(9, 3, scale=2.0, channels="least")
+    found = fitted([Sample(one.image, features, guide)], kernel, fused)
+    exact = Sample(one.image.double(), features.double(), Guide(guide[0].double(), guide[1].double()))
+    # Sums of float32 numbers, added one by one, would be wrong by more than 2e-4.
+    assert (found - fitted([exact], kernel)).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("fused", [False, True])
 def test_constant_repeated_and_rescaled_features_change_nothing(fused: bool) -> None:
     one = sample(features=2)
     expected = fitted([one], fused=fused)
