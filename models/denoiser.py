@@ -64,6 +64,7 @@ class Denoiser(nn.Module):
         frame_halo: Frames on each side that the exact result of a frame depends on.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
+        no_export: Why the method is not exported as ONNX or TorchScript; empty where it is.
         targets: Names of the buffers that training compares with.
         compared: Names of the pairs that `training_pairs` returns.
     """
@@ -78,6 +79,7 @@ class Denoiser(nn.Module):
     frame_halo: int = 0
     bytes_per_pixel: int = 500
     bytes_once: int = 0
+    no_export: str = ""
     targets: tuple[str, ...] = ("reference",)
     compared: tuple[str, ...] = ("color",)
 

@@ -47,7 +47,7 @@ from models.ops import halves
 from models.ops.features import Prefilter, filter_frames
 from models.ops.fireflies import limited_halves
 from models.ops.halves import ColorNoise, Halves, Noise
-from models.ops.nlm import Guide, PatchKernel
+from models.ops.nlm import UNROLLED, Guide, PatchKernel
 from models.ops.regression import Sample, collaborative_regression
 
 BANDWIDTHS = (0.5, 1.0)
@@ -101,7 +101,8 @@ class NFOR(Denoiser):
         feature_noise: The same for features, one word for all or one for each; `none`: not filtered.
         smoothing: Radius of the box in which `halves` averages squared differences.
         fireflies: `keep` them, as paper and public implementation do, or `limit` the halves of the colour by
-            each other before anything else, see `models.ops.fireflies`.
+            each other before anything else, see `models.ops.fireflies`; without effect where one buffer stands
+            for both halves.
         aux: Return errors, selection and filtered features as `Denoised.aux`.
         window: Radius of the regression window and of the windows that filter maps.
         patch: Radius of the patches.
@@ -112,6 +113,7 @@ class NFOR(Denoiser):
     """
 
     frame_numbers = ("exposure",)
+    no_export = UNROLLED
 
     def __init__(
         self,
@@ -155,12 +157,9 @@ class NFOR(Denoiser):
         self._last = PatchKernel(window, patch, (1.0,), scale=last, channels="least")
         self._maps = PatchKernel(window, 1, (1.0,))
         self.halo = self._reach()
-        # Resident memory grows by 282, 617 and 750 bytes with 0, 7 and 11 channels of features.
-        self.bytes_per_pixel = 320 + 50 * sum(buffer(name).channels for name in self.features)
-        self.frame_halo = 2 * frames * (2 if self._selects else 1)
         # Measured: growth of resident memory at 384x384 and 512x512, 0 to 14 channels of features, the larger
         # of both forms; the PyTorch form takes up to `memory` for its strips beside that.
-        self.bytes_per_pixel = 300 + 24 * sum(buffer(name).channels for name in self.features)
+        self.bytes_per_pixel = 320 + 26 * sum(buffer(name).channels for name in self.features)
 
     @property
     def _selects(self) -> bool:

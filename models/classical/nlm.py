@@ -29,7 +29,7 @@ from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops import halves
 from models.ops.fireflies import limited_halves
 from models.ops.halves import ColorNoise, Halves
-from models.ops.nlm import Guide, PatchKernel, nlm_filter
+from models.ops.nlm import UNROLLED, Guide, PatchKernel, nlm_filter
 from models.ops.pyramid import LOW_PASS, coarser, coarser_variance, finer
 from models.ops.symmetric import SymmetricKernel, residual_error, scaled_variance, symmetric_filter
 
@@ -64,6 +64,7 @@ class NLM(Denoiser):
     """
 
     frame_numbers = ("exposure",)
+    no_export = UNROLLED
 
     def __init__(
         self,

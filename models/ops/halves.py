@@ -69,7 +69,7 @@ _INSTEAD: dict[str, tuple[Noise, ...]] = {
 }
 _REASONS = {
     "halves": "the difference of the halves {0}_a and {0}_b stands for the variance, which is less exact",
-    "variance": "its mean stands for both halves, so that weights share the noise of what they filter",
+    "variance": "{0}, the mean, stands for both halves, so that weights share the noise of what they filter",
 }
 
 

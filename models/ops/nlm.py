@@ -36,6 +36,12 @@ from models.pace import tick
 CENTRE_FLOOR = 1e-4
 """Least weight of a pixel in its own window; it matters only where a variance is not a number."""
 
+UNROLLED = (
+    "it visits hundreds of window offsets one by one, which a graph would hold as so many copies of its "
+    "operations; use it from Python or with `trainer denoise`"
+)
+"""Why methods made of these operations are not exported."""
+
 
 @dataclass(frozen=True)
 class PatchKernel:
