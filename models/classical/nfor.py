@@ -101,8 +101,8 @@ class NFOR(Denoiser):
         feature_noise: The same for features, one word for all or one for each; `none`: not filtered.
         smoothing: Radius of the box in which `halves` averages squared differences.
         fireflies: `keep` them, as paper and public implementation do, or `limit` the halves of the colour by
-            each other before anything else, see `models.ops.fireflies`; without effect where one buffer stands
-            for both halves.
+            each other before anything else, see `models.ops.fireflies`; without effect where
+            one buffer stands for both halves.
         aux: Return errors, selection and filtered features as `Denoised.aux`.
         window: Radius of the regression window and of the windows that filter maps.
         patch: Radius of the patches.
