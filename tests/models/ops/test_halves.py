@@ -144,8 +144,8 @@ def test_variances_look_no_farther_than_stated() -> None:
     ("how", "available", "other", "reason"),
     [
         ("measured", {"color_a", "color_b"}, "halves", "no color_variance: the difference of the halves"),
-        ("measured", {"color", "color_variance"}, "variance", "no color_a and no color_b: its mean"),
-        ("halves", {"color", "color_variance", "color_a"}, "variance", "no color_b: its mean"),
+        ("measured", {"color", "color_variance"}, "variance", "no color_a and no color_b: color, the mean,"),
+        ("halves", {"color", "color_variance", "color_a"}, "variance", "no color_b: color, the mean,"),
         ("variance", {"color", "color_a", "color_b"}, "halves", "no color_variance: the difference"),
         ("measured", {"color"}, None, ""),
         ("estimated", {"color_a", "color_b"}, None, ""),
