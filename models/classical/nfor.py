@@ -157,6 +157,7 @@ class NFOR(Denoiser):
         self._last = PatchKernel(window, patch, (1.0,), scale=last, channels="least")
         self._maps = PatchKernel(window, 1, (1.0,))
         self.halo = self._reach()
+        self.frame_halo = 2 * frames * (2 if self._selects else 1)
         # Measured: growth of resident memory at 384x384 and 512x512, 0 to 14 channels of features, the larger
         # of both forms; the PyTorch form takes up to `memory` for its strips beside that.
         self.bytes_per_pixel = 320 + 26 * sum(buffer(name).channels for name in self.features)
