@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,10 @@ from models.denoiser import Buffers
 from models.ops.halves import Halves
 from tests.models import plain_nfor
 
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
+
 SIZE = 24
 NAMES = ("normal", "albedo", "depth")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 def scene(seed: int = 0) -> dict[str, Tensor]:

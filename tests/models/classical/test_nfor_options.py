@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,19 +17,11 @@ from tests.models import plain_nfor
 from tests.models.frames import split_buffers
 from tests.models.plain_nlm import nlm
 
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
+
 SMALL: dict[str, Any] = {"window": 2, "patch": 1, "prefilter_window": 2, "final_window": 1, "fused": False}
 RADII = plain_nfor.Radii(window=2, patch=1, prefilter=2, final=1)
 PARTS = ("a", "b", "variance")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,20 +16,12 @@ from models.classical.nfor import NFOR
 from models.ops import regression
 from tests.models import plain_nfor
 
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
+
 NAMES = ("normal", "albedo", "depth")
 PARTS = ("a", "b", "variance")
 ROWS, COLUMNS = slice(20, 44), slice(77, 101)
 """Part of outdoor-000003 with highlights of 17 among shadows of 0.04."""
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

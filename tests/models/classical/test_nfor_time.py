@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,8 @@ from torch import Tensor
 from models.classical.nfor import NFOR
 from tests.models import plain_nfor_time
 from tests.models.plain_nfor import Radii
+
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 SIZE, FRAMES, REACH = 12, 5, 2
 RADII = Radii(window=2, patch=1, prefilter=1, final=1)
@@ -25,16 +26,6 @@ SETTINGS: dict[str, Any] = {
     "final_window": 1,
 }
 NARROW: dict[str, Any] = {**SETTINGS, "frames": 1, "features": (), "window": 1}
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 def moving(frames: int, seed: int = 0) -> dict[str, Tensor]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -17,6 +15,8 @@ from models.tiling import denoise_tiled
 from tests.models import plain_nlm, plain_pyramid
 from tests.models.frames import largest_relative, split_buffers
 from tests.models.plain_nlm import Array
+
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -34,16 +34,6 @@ CLASSICAL: list[Denoiser] = [
     models.NFOR("paper", window=2, patch=1, prefilter_window=2, final_window=1),
 ]
 """Every classical method, its presets and inputs, with narrow windows."""
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 def noisy_buffers(batch: int, height: int, width: int) -> dict[str, Tensor]:

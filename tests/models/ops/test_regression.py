@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -14,16 +12,9 @@ from models.ops.regression import Sample, collaborative_regression
 from tests.models import plain_nfor
 from tests.models.frames import largest_relative
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 KERNEL = PatchKernel(3, 1, (0.7,), scale=2.0, channels="least")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def sample(height: int = 16, width: int = 18, features: int = 3, seed: int = 0) -> Sample:
