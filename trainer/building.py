@@ -31,8 +31,9 @@ def class_path_of(name: str, asked: str = "--model") -> str:
         FileNotFoundError: Penumbra has none of that name; the message lists those it has.
     """
     if "." not in name and name not in models.__all__:
-        near = difflib.get_close_matches(name, models.__all__, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        folded = {known.casefold(): known for known in models.__all__}
+        near = difflib.get_close_matches(name.casefold(), folded, n=1)
+        hint = f"; did you mean {folded[near[0]]}?" if near else ""
         known = ", ".join(models.__all__)
         if asked != "--model":
             raise FileNotFoundError(f"{asked} {name}: no such denoiser{hint} (there are {known})")

@@ -83,7 +83,9 @@ def advice(model: Model, has: Collection[str]) -> str:
     """
     options = options_of(type(model))
     missing = dict.fromkeys(base(name) for name in model.inputs if name not in has)
-    alone = [name for name in missing if name in has]
+    # What has a variance or halves as well needs no option: `instead` takes it once the rest is settled.
+    told = [n for n in missing if f"{n}_variance" in has or {f"{n}_a", f"{n}_b"} <= set(has)]
+    alone = [name for name in missing if name in has and name not in told]
     found = []
     if "color" in alone and "color_noise" in options:
         found.append("--option color_noise=estimated estimates the noise of color from the image itself")

@@ -29,7 +29,7 @@ class Kernels:
         if not self.wanted or self.there:
             return ""
         return (
-            "this runs in plain PyTorch; with Numba it is many times faster: "
+            "this runs in plain PyTorch; with Numba it is about ten times faster: "
             "pip install 'penumbra-denoise[fast]'"
         )
 

@@ -18,10 +18,11 @@ from typing import Any, Literal
 from torch import Tensor
 
 from data.buffers import buffer
-from models.classical.nlm import NLM, Fireflies, Sampling
+from models.classical.nlm import NLM, Sampling
 from models.denoiser import Buffers
 from models.ops import halves
 from models.ops.features import Prefilter
+from models.ops.fireflies import Fireflies
 from models.ops.halves import ColorNoise, Halves, Noise
 from models.ops.joint import Feature, JointKernel, joint_filter
 from models.ops.nlm import Guide
@@ -87,16 +88,9 @@ class JointNLM(NLM):
         self._arguments = arguments
         if combine not in ("least", "product"):
             raise ValueError(f"JointNLM: combine must be least or product, got {combine!r}")
-        each = [feature_noise] * len(features) if isinstance(feature_noise, str) else list(feature_noise)
-        if len(each) != len(features):
-            raise ValueError(
-                f"JointNLM: feature_noise must be one word, or one for each of the {len(features)} features, "
-                f"got {len(each)}"
-            )
-        self.noises: dict[str, Noise] = dict(zip(features, each, strict=True))
-        self.tau = tau
-        for name, noise in self.noises.items():
-            self.inputs += halves.inputs(name, halves.checked("JointNLM: feature_noise", noise))
+        self.features, self.tau = tuple(features), tau
+        self.noises = halves.of_features("JointNLM", self.features, feature_noise)
+        self.inputs += tuple(n for name, noise in self.noises.items() for n in halves.inputs(name, noise))
         self.joint = JointKernel(self.kernel, feature_bandwidth, combine)
         self.prefilter = Prefilter(prefilter_window, memory=memory, fused=fused)
         looked = [halves.reach(n) + self.prefilter.reach for n in self.noises.values() if n != "none"]
@@ -136,7 +130,7 @@ class JointNLM(NLM):
         result = {}
         for name, noise in self.noises.items():
             parts = Halves(*(x[:, None] for x in halves.halves(buffers, name, noise)))
-            a, b, _ = (x[:, 0] for x in self.prefilter(parts, noise))
+            a, b = (x[:, 0] for x in self.prefilter.halves(parts, noise))
             mean, residual = 0.5 * (a + b), 0.25 * (b - a).square()
             tau = self.tau * mean.square() if buffer(name).kind == "distance" else self.tau
             result[name] = Feature.of(mean, residual, tau)

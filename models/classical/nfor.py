@@ -45,7 +45,7 @@ from data.buffers import buffer
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops import halves
 from models.ops.features import Prefilter, filter_frames
-from models.ops.fireflies import limited_halves
+from models.ops.fireflies import KEPT, Fireflies, checked, limited_halves
 from models.ops.halves import ColorNoise, Halves, Noise
 from models.ops.nlm import UNROLLED, Guide, PatchKernel
 from models.ops.regression import Sample, collaborative_regression
@@ -101,8 +101,7 @@ class NFOR(Denoiser):
         feature_noise: The same for features, one word for all or one for each; `none`: not filtered.
         smoothing: Radius of the box in which `halves` averages squared differences.
         fireflies: `keep` them, as paper and public implementation do, or `limit` the halves of the colour by
-            each other before anything else, see `models.ops.fireflies`; without effect where
-            one buffer stands for both halves.
+            each other before anything else, see `models.ops.fireflies`; needs two halves.
         aux: Return errors, selection and filtered features as `Denoised.aux`.
         window: Radius of the regression window and of the windows that filter maps.
         patch: Radius of the patches.
@@ -124,7 +123,7 @@ class NFOR(Denoiser):
         color_noise: ColorNoise = "measured",
         feature_noise: Noise | Sequence[Noise] = "measured",
         smoothing: int = halves.SMOOTHING,
-        fireflies: Literal["keep", "limit"] = "keep",
+        fireflies: Fireflies = "keep",
         aux: bool = False,
         window: int = 9,
         patch: int = 3,
@@ -135,20 +134,17 @@ class NFOR(Denoiser):
     ) -> None:
         self._arguments = {n: v for n, v in locals().items() if n not in ("self", "__class__")}
         super().__init__()
-        for name, given, allowed in (
-            ("preset", preset, ("public", "paper")),
-            ("fireflies", fireflies, ("keep", "limit")),
-        ):
-            if given not in allowed:
-                raise ValueError(f"NFOR: {name} must be {' or '.join(allowed)}, got {given!r}")
+        if preset not in ("public", "paper"):
+            raise ValueError(f"NFOR: preset must be public or paper, got {preset!r}")
         if frames < 0 or smoothing < 0:
             raise ValueError(f"NFOR: frames and smoothing must be at least 0, got {frames} and {smoothing}")
         self.features = tuple(features)
         own = halves.checked("NFOR: color_noise", color_noise, get_args(ColorNoise))
-        self.noises = {"color": own, **_noises(self.features, feature_noise)}
+        self.noises = {"color": own, **halves.of_features("NFOR", self.features, feature_noise)}
         self.inputs = tuple(n for base, noise in self.noises.items() for n in halves.inputs(base, noise))
         self.preset, self.frames, self.smoothing = preset, frames, smoothing
-        self.fireflies, self.aux, self.memory, self.fused = fireflies, aux, memory, fused
+        self.fireflies = checked("NFOR", fireflies, own)
+        self.aux, self.memory, self.fused = aux, memory, fused
         second: Literal["mean", "halves"] = "mean" if preset == "public" else "halves"
         self._prefilter = Prefilter(prefilter_window, patch, final_window, second, memory, fused)
         self._first = PatchKernel(window, patch, BANDWIDTHS, scale=2.0, channels="least")
@@ -192,11 +188,14 @@ class NFOR(Denoiser):
                 reasons.append(reason)
         if not reasons:
             return None
-        if self._selects and not halves.independent(noises["color"]):
-            reasons[0] += "; NFOR then fits once, with one bandwidth"
         color_noise, *feature_noise = noises.values()
-        arguments: dict[str, Any] = {**self._arguments, "color_noise": color_noise}
-        return NFOR(**{**arguments, "feature_noise": feature_noise}), tuple(reasons)
+        changed: dict[str, Any] = {"color_noise": color_noise, "feature_noise": feature_noise}
+        if self._selects and not halves.independent(color_noise):
+            reasons[0] += "; NFOR then fits once, with one bandwidth"
+            if self.fireflies == "limit":
+                reasons[0] += KEPT
+                changed["fireflies"] = "keep"
+        return NFOR(**{**self._arguments, **changed}), tuple(reasons)
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Denoiser.forward`.
@@ -346,22 +345,3 @@ def estimated_error(noisy: Halves, filtered_a: Tensor, filtered_b: Tensor) -> Te
 def _joined(features: Sequence[Tensor], like: Tensor) -> Tensor:
     """Return features as one image (B, T, K, H, W), K = 0 where there are none."""
     return torch.cat([like[:, :, :0], *features], 2)
-
-
-def _noises(features: Sequence[str], noise: Noise | Sequence[Noise]) -> dict[str, Noise]:
-    """Return where each feature's halves come from.
-
-    Raises:
-        ValueError: A feature is unknown or given twice, or there is not one word for each.
-    """
-    for name in features:
-        buffer(name)
-    noises = [noise] * len(features) if isinstance(noise, str) else list(noise)
-    if len(set(features) | {"color"}) != len(features) + 1:
-        raise ValueError(f"NFOR: features must be different buffers beside color, got {', '.join(features)}")
-    if len(noises) != len(features):
-        raise ValueError(
-            f"NFOR: feature_noise must be one word, or one for each of the {len(features)} features, got "
-            f"{len(noises)}"
-        )
-    return {f: halves.checked("NFOR: feature_noise", n) for f, n in zip(features, noises, strict=True)}

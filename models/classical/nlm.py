@@ -27,7 +27,7 @@ from torch import Tensor
 
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops import halves
-from models.ops.fireflies import limited_halves
+from models.ops.fireflies import KEPT, Fireflies, checked, limited_halves
 from models.ops.halves import ColorNoise, Halves
 from models.ops.nlm import UNROLLED, Guide, PatchKernel, nlm_filter
 from models.ops.pyramid import LOW_PASS, coarser, coarser_variance, finer
@@ -35,7 +35,6 @@ from models.ops.symmetric import SymmetricKernel, residual_error, scaled_varianc
 
 Preset = Literal["plain", "rkz12"]
 Sampling = Literal["random", "low-discrepancy"]
-Fireflies = Literal["keep", "limit"]
 
 _SAMPLED = 10
 """Radius over which the variance of low-discrepancy samples is compared with the difference of the halves."""
@@ -56,7 +55,7 @@ class NLM(Denoiser):
         sampling: `low-discrepancy` scales the measured variance, which is too large then, by what the halves
             say; see `models.ops.symmetric.scaled_variance`.
         fireflies: `keep` them, or `limit` the halves of the colour by each other before anything else, see
-            `models.ops.fireflies`.
+            `models.ops.fireflies`; needs two halves.
         aux: Also return `residual`, (B, 1, H, W), see `models.ops.symmetric.residual_error`.
         memory: Working memory in bytes beside the buffers; none: 64 MB on a CPU, 4 GB on other devices.
         fused: Whether compiled kernels take over, None: where possible; see `models.ops.nlm.use_fused`.
@@ -90,7 +89,6 @@ class NLM(Denoiser):
         for option, given, allowed in (
             ("preset", preset, get_args(Preset)),
             ("sampling", sampling, get_args(Sampling)),
-            ("fireflies", fireflies, get_args(Fireflies)),
         ):
             if given not in allowed:
                 raise ValueError(f"{name}: {option} must be {' or '.join(allowed)}, got {given!r}")
@@ -106,8 +104,9 @@ class NLM(Denoiser):
         self.rkz12 = (
             SymmetricKernel(self.kernel, symmetric, smooth, least_weight) if preset == "rkz12" else None
         )
-        self.color_noise, self.sampling, self.fireflies, self.aux = color_noise, sampling, fireflies, aux
-        self.memory, self.fused = memory, fused
+        self.fireflies = checked(name, fireflies, color_noise)
+        self.color_noise, self.sampling, self.aux, self.memory = color_noise, sampling, aux, memory
+        self.fused = fused if preset == "plain" else False  # there are no compiled kernels for the other
         self.inputs = halves.inputs("color", color_noise)
         self.halo = self._filter_reach() + self._color_reach()
 
@@ -152,7 +151,15 @@ class NLM(Denoiser):
         found = halves.possible("color", self.color_noise, available)
         if found is None:
             return {}, ()
-        return {"color_noise": found[0], "sampling": "random"}, (found[1],)
+        noise, reason = found
+        changed = {"color_noise": noise, "sampling": "random"}
+        if not halves.independent(noise):
+            if self.sampling == "low-discrepancy":
+                reason += "; its variance is that of random samples, too large for these"
+            if self.fireflies == "limit":
+                reason += KEPT
+                changed["fireflies"] = "keep"
+        return changed, (reason,)
 
     def _without(self) -> str:
         return "color_noise=estimated needs color alone"

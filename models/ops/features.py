@@ -70,21 +70,30 @@ class Prefilter:
             halves: (B, T, C, H, W).
             noise: Where they come from.
         """
+        a, b = self.halves(halves, noise)
+        if not independent(noise):
+            return Filtered(a, b, a)
+        mean = 0.5 * (a + b)
+        if self.second == "halves":
+            return Filtered(a, b, mean)
+        again = PatchKernel(self.again, self.patch, (0.5,))
+        return Filtered(a, b, self.nlm(mean, mean, 0.25 * (b - a).square(), again))
+
+    def halves(self, halves: Halves, noise: Noise) -> tuple[Tensor, Tensor]:
+        """Filter the halves only; arguments as for the whole filter."""
         a, b, variance = halves
         if noise == "none":
-            return Filtered(a, b, a)
+            return a, b
         first = PatchKernel(self.window, self.patch, (0.5,), scale=2.0)
         if not independent(noise):
             once = self.nlm(a, a, variance, first)
-            return Filtered(once, once, once)
+            return once, once
         a, b = self.nlm(a, b, variance, first), self.nlm(b, a, variance, first)
-        residual = 0.25 * (b - a).square()
         if self.second == "halves":
+            residual = 0.25 * (b - a).square()
             second = PatchKernel(self.again, self.patch, (0.5,), scale=2.0)
             a, b = self.nlm(a, b, residual, second), self.nlm(b, a, residual, second)
-            return Filtered(a, b, 0.5 * (a + b))
-        mean = 0.5 * (a + b)
-        return Filtered(a, b, self.nlm(mean, mean, residual, PatchKernel(self.again, self.patch, (0.5,))))
+        return a, b
 
     def nlm(self, image: Tensor, guide: Tensor, variance: Tensor, kernel: PatchKernel) -> Tensor:
         """Filter an image (B, T, C, H, W), each frame by itself."""

@@ -23,15 +23,27 @@ of stills of 32 samples per pixel, sum of the limited by that of the given image
 (veach-lamp at this number of samples is fireflies for the most part). With LIMIT = 1 errors are about as low,
 but ordinary noise is cut off as well: 0.973 is left of sponza, 0.902 of classroom.
 
+It takes two halves: where one buffer stands for both, each pixel lies in its own neighbourhood and stays.
+
 Related: RDFC (doi:10.1111/cgf.12219) and LBF (doi:10.1145/2766977) replace outliers by medians of 3x3 pixels.
 """
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch.nn.functional as F
 from torch import Tensor
 
-from models.ops.halves import Halves
+from models.ops.halves import Halves, Noise, independent
+
+Fireflies = Literal["keep", "limit"]
+"""What methods do with them."""
+
+
+KEPT = "; its fireflies stay, since they are known by what the other half does not show"
+"""Added to the reason where one buffer comes to stand for both halves of a colour whose fireflies were to be
+limited."""
 
 LIMIT = 2.0
 """How far a pixel may exceed the largest value around it in the other half."""
@@ -49,6 +61,22 @@ def limited_halves(halves: Halves) -> Halves:
     limited_a, limited_b = a * _share(a, b), b * _share(b, a)
     share = (limited_a + limited_b).clamp_min(_TINY) / (a + b).clamp_min(_TINY)
     return Halves(limited_a, limited_b, variance * share.square())
+
+
+def checked(method: str, fireflies: Fireflies, noise: Noise) -> Fireflies:
+    """Refuse an unknown word, and to limit fireflies of a colour without two halves.
+
+    Raises:
+        ValueError: Names the method, the option and what it may be.
+    """
+    if fireflies not in get_args(Fireflies):
+        raise ValueError(f"{method}: fireflies must be keep or limit, got {fireflies!r}")
+    if fireflies == "limit" and not independent(noise):
+        raise ValueError(
+            f"{method}: fireflies=limit compares two halves of the colour, and color_noise={noise} has none; "
+            "use fireflies=keep"
+        )
+    return fireflies
 
 
 def _share(image: Tensor, other: Tensor) -> Tensor:

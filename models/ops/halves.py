@@ -34,13 +34,14 @@ Measured on stills of 32 samples per pixel whose variance is known: the mean of 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from data.buffers import buffer
 from models.ops.boxes import box_sum_valid
 
 Noise = Literal["measured", "halves", "variance", "estimated", "none"]
@@ -190,6 +191,32 @@ def checked(option: str, noise: Noise, allowed: Collection[str] = get_args(Noise
     if noise not in allowed:
         raise ValueError(f"{option} must be one of {', '.join(allowed)}, got {noise!r}")
     return noise
+
+
+def of_features(method: str, features: Sequence[str], noise: Noise | Sequence[Noise]) -> dict[str, Noise]:
+    """Return where each feature's halves come from.
+
+    Args:
+        method: Name of the method, for messages.
+        features: Names of plain buffers.
+        noise: One word for all, or one for each.
+
+    Raises:
+        ValueError: A feature is unknown, the colour or given twice, or there is not one word for each.
+    """
+    for name in features:
+        buffer(name)
+    if len(set(features) | {"color"}) != len(features) + 1:
+        raise ValueError(
+            f"{method}: features must be different buffers beside color, got {', '.join(features)}"
+        )
+    noises = [noise] * len(features) if isinstance(noise, str) else list(noise)
+    if len(noises) != len(features):
+        raise ValueError(
+            f"{method}: feature_noise must be one word, or one for each of the {len(features)} features, "
+            f"got {len(noises)}"
+        )
+    return {f: checked(f"{method}: feature_noise", n) for f, n in zip(features, noises, strict=True)}
 
 
 def _working(image: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from PIL import Image
 import trainer.kernels as kernels
 from data.exr import read_exr, read_frame, write_frame
 from data.frame import Frame
-from models import NFOR
+from models import NFOR, NLM
 from tests.models.frames import split_buffers
 from trainer.commands import denoise as command
 from trainer.configs import UsageError
@@ -184,6 +184,15 @@ def test_an_absent_feature_is_an_error_that_names_the_option_without_it(tmp_path
         run(source, *given, options=SMALL)
 
 
+def test_what_has_a_variance_is_not_to_be_estimated(tmp_path: Path) -> None:
+    source = write(tmp_path / "in" / "f0.exr", frame("color", "color_variance", "normal", "normal_variance"))
+    given = ("--model", "NFOR", "--output", tmp_path / "out")
+    with pytest.raises(ValueError, match="--option features=normal does without albedo, depth") as error:
+        run(source, *given, options=SMALL)
+    assert "estimated" not in str(error.value)
+    run(source, *given, options=("features=normal", *SMALL))
+
+
 def test_halves_in_files_of_their_own_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     parts = {"": "", "_a": "A", "_b": "B", "_variance": "Variance"}
     made = frame(*COLOR, *NORMAL)
@@ -224,6 +233,7 @@ def test_without_numba_the_torch_form_runs_and_slow_frames_get_a_hint(
     hint = kernels.Kernels(method, "cpu").hint
     assert "pip install 'penumbra-denoise[fast]'" in hint
     assert kernels.Kernels(NFOR(fused=False), "cpu").hint == ""
+    assert kernels.Kernels(NLM(preset="rkz12"), "cpu").hint == ""
     assert kernels.Kernels(method, "cuda").hint == ""
     source = write(tmp_path / "in" / "f000.exr", frame(*COLOR, *NORMAL))
     assert nfor(source, tmp_path / "out") == 0

@@ -77,3 +77,5 @@ def test_an_unknown_denoiser_is_named_with_the_nearest(
 ) -> None:
     with pytest.raises(FileNotFoundError, match=r"NFR: no such denoiser; did you mean NFOR\?"):
         run(capsys, monkeypatch, "NFR")
+    with pytest.raises(FileNotFoundError, match=r"jointnlm: no such denoiser; did you mean JointNLM\?"):
+        run(capsys, monkeypatch, "jointnlm")

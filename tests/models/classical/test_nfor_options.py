@@ -123,6 +123,15 @@ def test_what_lacks_is_done_without_and_said(
     assert other({name: buffers[name] for name in other.inputs}).color.isfinite().all()
 
 
+def test_fireflies_that_cannot_be_told_any_more_are_kept_and_that_is_said(buffers: dict[str, Tensor]) -> None:
+    found = NFOR(features=(), fireflies="limit", **SMALL).instead({"color", "color_variance"})
+    assert found is not None
+    other, (reason,) = found
+    assert isinstance(other, NFOR)
+    assert other.fireflies == "keep"
+    assert "one bandwidth; its fireflies stay" in reason
+
+
 def test_what_only_the_user_can_say_is_not_assumed(buffers: dict[str, Tensor]) -> None:
     network = NFOR(features=("albedo",), **SMALL)
     assert network.instead(set(buffers)) is None
@@ -169,6 +178,7 @@ def test_tiles_with_the_halo_give_the_whole_image(options: dict[str, Any]) -> No
         ({"features": ("depth", "depth")}, "features must be different buffers beside color"),
         ({"features": ("color",)}, "features must be different buffers beside color"),
         ({"fireflies": "drop"}, "fireflies must be keep or limit, got 'drop'"),
+        ({"fireflies": "limit", "color_noise": "variance"}, "NFOR: fireflies=limit compares two halves"),
         ({"smoothing": -1}, "frames and smoothing must be at least 0, got 0 and -1"),
     ],
 )

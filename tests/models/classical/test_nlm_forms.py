@@ -253,6 +253,7 @@ def test_features_without_noise_are_used_as_they_are() -> None:
         ({"sampling": "low-discrepancy", "color_noise": "halves"}, "needs no correction"),
         ({"color_noise": "none"}, "NLM: color_noise must be one of measured"),
         ({"fireflies": "drop"}, "NLM: fireflies must be keep or limit"),
+        ({"fireflies": "limit", "color_noise": "estimated"}, "NLM: fireflies=limit compares two halves"),
         ({"preset": "rkz12", "smoothing": -1}, "smooths weights must be at least 0"),
         ({"preset": "rkz12", "least_weight": 1.0}, r"must be in \[0, 1\)"),
     ],
@@ -260,3 +261,27 @@ def test_features_without_noise_are_used_as_they_are() -> None:
 def test_impossible_options_are_refused(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NLM(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("features", "noise", "message"),
+    [
+        (("normal", "normal"), "measured", "JointNLM: features must be different buffers beside color"),
+        (("color",), "measured", "JointNLM: features must be different buffers beside color"),
+        (("foo",), "measured", "foo"),
+        (("normal", "depth"), ["none"], "JointNLM: feature_noise must be one word, or one for each of the 2"),
+    ],
+)
+def test_impossible_features_are_refused(features: tuple[str, ...], noise: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        JointNLM(features, feature_noise=noise)  # type: ignore[arg-type]
+
+
+def test_corrections_that_need_two_halves_are_dropped_and_that_is_said() -> None:
+    found = NLM(sampling="low-discrepancy", fireflies="limit").instead({"color", "color_variance"})
+    assert found is not None
+    other, (reason,) = found
+    assert isinstance(other, NLM)
+    assert (other.color_noise, other.sampling, other.fireflies) == ("variance", "random", "keep")
+    assert "its variance is that of random samples" in reason
+    assert "its fireflies stay" in reason
