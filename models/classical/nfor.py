@@ -93,12 +93,16 @@ class NFOR(Denoiser):
     filtered frame by frame. Memory per pixel then counts for each frame.
 
     Args:
-        preset: `public` or `paper`, see above.
+        preset: `public` does what the authors' implementation does, `paper` what their text says where that
+            differs.
         features: Names of the buffers that the regression uses, any subset of the vocabulary; may be empty.
         frames: Frames before and after a pixel's own that its window spans; the paper uses 2.
-        color_noise: Where halves of the colour and their variance come from, see `models.ops.halves`; not
-            `none`. Where one buffer stands for both halves there is one regression, see above.
-        feature_noise: The same for features, one word for all or one for each; `none`: not filtered.
+        color_noise: Where halves and variance of the colour come from: `measured` reads all three, `halves`
+            takes the variance from the difference of both halves, `variance` reads the mean and its variance,
+            `estimated` the image alone (`models.ops.halves`). The last two have no halves to select by: one
+            regression, one bandwidth.
+        feature_noise: The same for features, one word for all or one for each; `none` takes them as free of
+            noise and does not filter them.
         smoothing: Radius of the box in which `halves` averages squared differences.
         fireflies: `keep` them, as paper and public implementation do, or `limit` the halves of the colour by
             each other before anything else, see `models.ops.fireflies`; needs two halves.

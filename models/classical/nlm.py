@@ -47,11 +47,13 @@ class NLM(Denoiser):
         window: Radius of the window.
         patch: Radius of the patches.
         bandwidth: k, how different patches may be that still count, in units of their noise.
-        preset: `plain` or `rkz12`, see above.
+        preset: `plain` is fast, `rkz12` does what that paper's code does: better, at forty times the time.
         symmetric: Preset `rkz12`: compare opposite neighbours together.
         smoothing: Preset `rkz12`: radius of the box that averages weights, 0: none, None: as the patch.
         least_weight: Preset `rkz12`: smaller weights are dropped.
-        color_noise: Where halves and variance come from, see `models.ops.halves`.
+        color_noise: Where halves and variance of the colour come from: `measured` reads all three, `halves`
+            takes the variance from the difference of both halves, `variance` reads the mean and its variance,
+            `estimated` the image alone (`models.ops.halves`).
         sampling: `low-discrepancy` scales the measured variance, which is too large then, by what the halves
             say; see `models.ops.symmetric.scaled_variance`.
         fireflies: `keep` them, or `limit` the halves of the colour by each other before anything else, see
