@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -116,6 +118,31 @@ def derive(
     for name in names:
         context.need(name)
     return result
+
+
+def obtainable(
+    frame: Frame,
+    names: Iterable[str],
+    *,
+    depth_kind: DepthKind = "euclidean",
+    previous: Camera | None = None,
+) -> set[str]:
+    """Return which of these buffers a frame has or `derive` adds; found out on a frame of one pixel.
+
+    Args:
+        frame: The frame.
+        names: Buffers that are asked for.
+        depth_kind: As for `derive`.
+        previous: As for `derive`.
+    """
+    pixels = {name: np.ones((1, 1, array.shape[2]), np.float32) for name, array in frame.buffers.items()}
+    pixel = replace(frame, buffers=pixels, samples=None, notes={})
+    found = set()
+    for name in names:
+        with suppress(ValueError):
+            derive(pixel, [name], depth_kind=depth_kind, previous=previous)
+            found.add(name)
+    return found
 
 
 _LOOKED_AT = {

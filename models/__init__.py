@@ -8,8 +8,9 @@ from models.acfm import ACFM
 from models.afgsa import AFGSA
 from models.classical.cross_bilateral import CrossBilateral
 from models.classical.joint_bilateral import JointBilateral
+from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
-from models.classical.nlm import NLM, JointNLM, MultiScaleNLM
+from models.classical.nlm import NLM, MultiScaleNLM
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN

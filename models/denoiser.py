@@ -5,7 +5,7 @@ Shape letters: B batch, T frames, S samples per pixel, C channels, H rows, W col
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -23,10 +23,13 @@ class Denoised(NamedTuple):
     Attributes:
         color: Linear radiance (B, 3, H, W) in the units of the input.
         state: What a recurrent method carries to the next frame, otherwise None.
+        aux: What the method made on its way and was asked for, (B, C, H, W) with one or three channels: name
+            of a layer, or of the buffer that it is a filtered form of. Otherwise None.
     """
 
     color: Tensor
     state: Any = None
+    aux: Mapping[str, Tensor] | None = None
 
 
 class Pair(NamedTuple):
@@ -62,8 +65,12 @@ class Denoiser(nn.Module):
         samples: Quantities in `samples`, in this order (`data.buffers.sample_channels` lists the channels);
             `select` brings a batch into it.
         fill: Quantity → the constant that stands for it where a batch's samples lack it.
+        frames: Frames before and after a frame that one step of a space-time method looks at; 0: images.
+            Otherwise buffers are sequences (B, T, C, H, W), and `forward` returns the middle frame.
+        frame_halo: Frames on each side that the exact result of a frame depends on.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
+        no_export: Why the method is not exported as ONNX or TorchScript; empty where it is.
         targets: Names of the buffers that training compares with.
         compared: Names of the pairs that `training_pairs` returns.
     """
@@ -76,8 +83,11 @@ class Denoiser(nn.Module):
     per_sample: bool = False
     samples: tuple[str, ...] = ()
     fill: Mapping[str, float] = {}
+    frames: int = 0
+    frame_halo: int = 0
     bytes_per_pixel: int = 500
     bytes_once: int = 0
+    no_export: str = ""
     targets: tuple[str, ...] = ("reference",)
     compared: tuple[str, ...] = ("color",)
 
@@ -92,6 +102,38 @@ class Denoiser(nn.Module):
             ValueError: A buffer is missing or has another shape (see `check`).
         """
         raise TypeError(f"{type(self).__name__} does not define forward")
+
+    def sequence(self, buffers: Buffers) -> Tensor:
+        """Denoise all frames of a sequence, for space-time methods.
+
+        Args:
+            buffers: Tensors (B, T, C, H, W) for each name of `inputs`, and optionally frame numbers.
+
+        Returns:
+            Linear radiance (B, T, 3, H, W).
+
+        Raises:
+            ValueError: A buffer is missing or has another shape.
+        """
+        raise TypeError(f"{type(self).__name__} does not denoise sequences")
+
+    def clip(self, buffers: Buffers) -> Denoised:
+        """Denoise all frames of a sequence as `sequence` does, with `aux` (B, T, C, H, W) where asked for."""
+        return Denoised(self.sequence(buffers))
+
+    def instead(self, available: Collection[str]) -> tuple[Denoiser, tuple[str, ...]] | None:
+        """Return the form of this method that does with the buffers that a frame has.
+
+        It never assumes what only the user can know, such as that a feature has no noise: that is an option
+        of the method, and `forward` says so where a buffer is missing.
+
+        Args:
+            available: Names of the buffers that there are or that can be derived.
+
+        Returns:
+            The other form and the reasons, one sentence each; None: there is none, or none is needed.
+        """
+        return None
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return the frame numbers that need the whole frame, from whole frames.

@@ -113,6 +113,15 @@ class Layered(NamedTuple):
     alpha: Tensor
     color: Tensor
 
+    def named(self) -> dict[str, Tensor]:
+        """Return `layer0_unfiltered`, `layer0_alpha`, `layer0_filtered`, `layer1_unfiltered` …, from front to
+        back, (B, 3 or 1, H, W)."""
+        made = {}
+        for layer in range(self.alpha.shape[1]):
+            for what in ("unfiltered", "alpha", "filtered"):
+                made[f"layer{layer}_{what}"] = getattr(self, what)[:, layer]
+        return made
+
 
 class Sorted(NamedTuple):
     """What layers hold: radiance (B, L, 3, H, W), weight (B, L, 1, H, W), embedding (B, L, E, H, W)."""
@@ -179,11 +188,15 @@ class Layer(_Sampled):
         recompute: In training, compute what belongs to single samples again in the backward pass.
         fill: Quantity → the constant that stands for it where samples lack it, such as `{"lens": 0}`.
 
+    Attributes:
+        aux: Return each layer as `Denoised.aux` (`Layered.named`).
+
     Raises:
         ValueError: An argument is out of range; the message names it.
     """
 
     order = _LAYER_ORDER
+    aux = False
 
     def __init__(
         self,
@@ -220,7 +233,8 @@ class Layer(_Sampled):
         Raises:
             ValueError: Samples are missing or have another shape.
         """
-        return Denoised(self.layered(buffers).color)
+        made = self.layered(buffers)
+        return Denoised(made.color, None, made.named() if self.aux else None)
 
     def layered(self, buffers: Buffers) -> Layered:
         """Return what becomes of each layer, from the same buffers as `forward`; linear radiance."""

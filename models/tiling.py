@@ -6,7 +6,8 @@ numbers that need the whole frame are measured once. Tiled equals untiled to rou
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,13 +16,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from data.buffers import FRAME_NUMBERS, SAMPLES
+from models.denoiser import Denoised
+from models.pace import Pace, listening
 
 BYTES_PER_PIXEL = 500
 """Working memory per pixel where a method does not declare `bytes_per_pixel`: ONNX Runtime was measured to
 take 410 for WSKP at 1280x720."""
 
 SMALLEST_CORE = 16
-"""Rows and columns of the smallest core: below that nearly all work would be halo."""
+"""Rows and columns of the smallest core, or as many as the halo has where that is more: below that nearly all
+work would be halo. So a pixel is read about nine times at most."""
 
 DEFAULT_BUDGET = 2 * 1024**3
 """Working memory in bytes where the caller names none: four million pixels in one piece."""
@@ -79,7 +83,7 @@ def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int
         denoiser: Declares `halo`, `multiple` and optionally `bytes_per_pixel` and `bytes_once`.
         size: Height and width of the image, multiples of `multiple`.
         budget: Working memory in bytes.
-        batch: Images that are denoised at once.
+        batch: Images that are denoised at once; of sequences, all of their frames.
 
     Raises:
         ValueError: Not even the smallest tile fits; the message says how much is needed.
@@ -88,7 +92,7 @@ def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int
     once = int(getattr(denoiser, "bytes_once", 0))
     halo, multiple = aligned_halo(denoiser), denoiser.multiple
     (tall, wide), pixels = size, max(budget - once, 0) // per_pixel
-    smallest = _round_up(SMALLEST_CORE, multiple)
+    smallest = _round_up(max(SMALLEST_CORE, halo), multiple)
     found: list[tuple[int, tuple[int, int]]] = []
     for pieces in range(1, -(-tall // smallest) + 1):
         rows = _even(tall, -(-tall // pieces), multiple)
@@ -104,6 +108,12 @@ def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int
             f"expected at least {(height * width * per_pixel + once) / 1e6:.1f} MB"
         )
     return min(found)[1]
+
+
+def times_read(denoiser: Tileable, size: tuple[int, int], core: tuple[int, int]) -> float:
+    """Return how often a pixel is read on average when an image is cut into these cores; 1: in one piece."""
+    halo = aligned_halo(denoiser)
+    return _read(size[0], core[0], halo) * _read(size[1], core[1], halo) / (size[0] * size[1])
 
 
 def _read(size: int, core: int, halo: int) -> int:
@@ -137,18 +147,33 @@ def denoise_tiled(
     tile: int | None = None,
     budget: int = DEFAULT_BUDGET,
 ) -> Tensor:
+    """Return only the colour of `denoise_in_tiles`, (B, 3, H, W) or (B, T, 3, H, W)."""
+    return denoise_in_tiles(denoiser, buffers, tile=tile, budget=budget).color
+
+
+def denoise_in_tiles(
+    denoiser: Tileable,
+    buffers: Mapping[str, Tensor],
+    *,
+    tile: int | None = None,
+    budget: int = DEFAULT_BUDGET,
+    progress: Callable[[float], None] | None = None,
+    pace: Pace | None = None,
+) -> Denoised:
     """Denoise images of any size within a memory budget; equal to one untiled call to 1e-5.
 
     Args:
         denoiser: A `models.Denoiser`, or an object with the attributes of `Tileable`. Not recurrent.
-        buffers: Tensors (B, C, H, W) for each of its inputs, `samples` (B, S, C, H, W), optionally frame
-            numbers (`exposure` …); numbers that `measure` gives and the mapping lacks are measured on these
-            images.
+        buffers: Tensors (B, C, H, W) for each of its inputs, sequences (B, T, C, H, W) for space-time
+            methods, `samples` (B, S, C, H, W), optionally frame numbers (`exposure` …); those that `measure`
+            gives and the mapping lacks are measured on these images.
         tile: Largest side of a core in pixels, at least the method's multiple; None: from `budget`.
         budget: Working memory of the method in bytes.
+        progress: Called after each tile with the share of the work that is done.
+        pace: Of the method, to call `progress` within tiles too.
 
     Returns:
-        Linear radiance (B, 3, H, W).
+        Linear radiance (B, 3, H, W) or all frames (B, T, 3, H, W), and `aux` where the method returns it.
 
     Raises:
         ValueError: A buffer is missing, sizes differ, or the budget is too small.
@@ -158,23 +183,74 @@ def denoise_tiled(
     multiple = denoiser.multiple
     images = {name: _padded(name, buffers[name], multiple) for name in denoiser.inputs}
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
-    result: Tensor | None = None
+    call: Callable[[Mapping[str, Tensor]], Any] = denoiser
+    if getattr(denoiser, "frames", 0):
+        call = denoiser.clip  # type: ignore[attr-defined]  # declared by methods with `frames`
     if tile is None:
         core = core_size(denoiser, (tall, wide), budget, batch)
     else:
         core = (_even(tall, max(tile, 1), multiple), _even(wide, max(tile, 1), multiple))
+    whole = _Whole((tall, wide))
     for piece in tiles(tall, wide, core, aligned_halo(denoiser)):
         rows, columns = piece.read
         part = {name: image[..., rows, columns].contiguous() for name, image in images.items()}
-        color = _color(denoiser({**part, **numbers}))
-        if result is None:
-            result = color.new_empty(batch, 3, tall, wide)
+        with _steps(progress, pace, whole.done, _share(piece, (tall, wide))):
+            result = call({**part, **numbers})
+        whole.place(piece, result)
+        if progress is not None:
+            progress(whole.done)
+    return whole.cut(height, width)
+
+
+def _share(piece: Tile, size: tuple[int, int]) -> float:
+    rows, columns = piece.core
+    return (rows.stop - rows.start) * (columns.stop - columns.start) / (size[0] * size[1])
+
+
+@contextmanager
+def _steps(
+    progress: Callable[[float], None] | None, pace: Pace | None, done: float, share: float
+) -> Iterator[None]:
+    """Tell the steps within a tile that stands for a share of the work."""
+    if progress is None or pace is None:
+        yield
+        return
+    steps = 0.0
+
+    def tell(step: float) -> None:
+        nonlocal steps
+        steps += step
+        progress(done + share * pace.share(steps))
+
+    with listening(tell):
+        yield
+
+
+class _Whole:
+    """What the tiles of an image are put into, and the share of its pixels that is done."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size, self.done = size, 0.0
+        self.layers: dict[str | None, Tensor] = {}
+        self.has_aux = False
+
+    def place(self, piece: Tile, result: Any) -> None:
+        """Copy the core of a tile's result."""
         inner_rows, inner_columns = (
             slice(c.start - r.start, c.stop - r.start) for c, r in zip(piece.core, piece.read, strict=True)
         )
-        result[..., piece.core[0], piece.core[1]] = color[..., inner_rows, inner_columns]
-    assert result is not None
-    return result[..., :height, :width]
+        aux = getattr(result, "aux", None)
+        self.has_aux |= aux is not None
+        for name, image in {None: _color(result), **(aux or {})}.items():
+            if name not in self.layers:
+                self.layers[name] = image.new_empty(*image.shape[:-2], *self.size)
+            self.layers[name][..., piece.core[0], piece.core[1]] = image[..., inner_rows, inner_columns]
+        self.done += _share(piece, self.size)
+
+    def cut(self, height: int, width: int) -> Denoised:
+        """Return the result without the rows and columns that were padded."""
+        aux = {n: image[..., :height, :width] for n, image in self.layers.items() if n is not None}
+        return Denoised(self.layers[None][..., :height, :width], aux=aux if self.has_aux else None)
 
 
 def numbers_of_frame(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -195,7 +271,8 @@ def _size(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> tuple[int, int, 
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in shapes.items())
         raise ValueError(f"buffers of different size: {listed}; expected one size")
     first = buffers[denoiser.inputs[0]]
-    return first.shape[0], first.shape[-2], first.shape[-1]
+    frames = first.shape[1] if getattr(denoiser, "frames", 0) else 1
+    return first.shape[0] * frames, first.shape[-2], first.shape[-1]
 
 
 def aligned_halo(denoiser: Tileable) -> int:
@@ -219,6 +296,8 @@ def _padded(name: str, image: Tensor, multiple: int) -> Tensor:
         return image
     if name == SAMPLES:  # pixels without samples, so that nothing from beyond the image is splatted into it
         return F.pad(image, (0, right, 0, bottom), value=torch.nan)
+    if image.ndim == 5:  # `F.pad` repeats borders of (B, C, H, W) only
+        return _padded(name, image.flatten(0, 1), multiple).unflatten(0, image.shape[:2])
     return F.pad(image, (0, right, 0, bottom), mode="replicate")
 
 

@@ -24,7 +24,7 @@ COMMANDS = {
     "inspect": "say what a file, a data set or shards contain",
     "denoise": "denoise EXR files and sequences",
     "export": "write a trained denoiser as ONNX or TorchScript",
-    "models": "list denoisers and registered models",
+    "models": "list denoisers, their options, and registered models",
     "upload": "send a run that was tracked locally to a tracking server",
 }
 

@@ -20,6 +20,9 @@ from data.frames import FrameSet
 from data.layouts import layout, likeliest
 from data.root import SAMPLE, resolve_root
 
+BESIDE = "tungsten"
+"""The layout whose frames are several files in one folder: `color.exr`, `colorA.exr`, `normal.exr` …"""
+
 
 @dataclass(frozen=True)
 class Item:
@@ -99,6 +102,8 @@ def _folder(path: Path, split: str | None) -> list[Clip]:
         kind = likeliest(path)
         if kind is not None:
             return _layout(path, kind)
+    if layout(BESIDE).likeness(path) > 0:
+        return _layout(path, BESIDE)
     found = sorted(path.glob("*.exr"), key=_order)
     if not found:
         raise ValueError(

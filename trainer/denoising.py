@@ -1,30 +1,36 @@
 """Frames in, denoised frames out: what `trainer denoise` does to each frame of a clip.
 
 Derive what is missing, choose the exposure, accumulate where the model was trained so, denoise in tiles that
-fit the memory budget. On request the attention of one pixel is looked at as well.
+fit the memory budget. On request the attention of one pixel is looked at as well. Space-time methods see
+several frames at once: `trainer.sequences`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from data.buffers import SAMPLES, buffer
+from data.buffers import SAMPLES
 from data.derive import automatic_exposure, derive
 from data.frame import Frame, Image
 from data.temporal import Accumulator
 from models.denoiser import Denoiser
-from models.tiling import denoise_tiled
+from models.pace import Pace
+from models.tiling import denoise_in_tiles
 from trainer.attention import Attention, attention_of, attentive, inside
-from trainer.clips import Clip
+from trainer.clips import Clip, Item
 from trainer.export.description import DISTRIBUTION, installed_version
-from trainer.loading import Loaded
-from trainer.samples import LayerImages, dropped, layers_of, sample_tensor, with_layers
+from trainer.inputs import Fitting, Say, advice
+from trainer.loading import Loaded, Model
+from trainer.samples import dropped, sample_tensor
+
+LARGE, SAMPLE = 20_000, 32
+"""Pixels of all frames above which the time of steps is measured first, and on how large a corner."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,6 @@ class Settings:
         memory: Bytes that one call of the model may take; larger images are tiled.
         device: Where to run.
         attention: Column and row of the pixel whose attention is wanted.
-        layers: Whether the layers of the model are wanted.
     """
 
     exposure: float | None = None
@@ -47,7 +52,6 @@ class Settings:
     memory: int = 2 * 1024**3
     device: str = "cpu"
     attention: tuple[int, int] | None = None
-    layers: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Result:
         accumulated: Radiance accumulated over the preceding frames, None where that was not done.
         reference: Converged radiance, None where the frame has none.
         attention: Of the pixel that the settings name, None where they name none.
-        layers: What became of the layers, None where that is not wanted.
+        aux: What the method made on its way (H, W, C), by layer or buffer; empty where it was not asked for.
     """
 
     frame: Frame
@@ -70,35 +74,28 @@ class Result:
     accumulated: Image | None
     reference: Image | None
     attention: Attention | None = None
-    layers: LayerImages | None = None
+    aux: Mapping[str, Image] = field(default_factory=dict)
 
 
-def replaced_pixels(frame: Frame) -> str | None:
-    """Return which pixels of a frame are not what its file holds, in one sentence; None where all are.
+@dataclass(frozen=True)
+class Prepared:
+    """A frame with all that the model reads.
 
-    From `notes["repaired"]`, pixels that were NaN or Inf, and `notes["outside_data_window"]`.
+    Attributes:
+        frame: With derived, and where the model expects it accumulated, buffers.
+        exposure: To denoise it with.
+        noisy: Radiance of the frame alone (H, W, 3).
+        follows: Whether it is the successor of the frame before.
+        model: The form of the model that does with its buffers.
+        reasons: Why that is not the one that was asked for.
     """
-    parts = []
-    for name, number in frame.notes.get("repaired", {}).items():
-        if name == SAMPLES:
-            parts.append(
-                f"{number} values of samples were NaN or Inf, replaced by those of rays that hit nothing"
-            )
-            continue
-        neighbours = buffer(name).repair == "neighbours"
-        by = "the mean of their finite neighbours, 0 where there are none" if neighbours else _no_hit(name)
-        parts.append(f"{_pixels(number, name)} NaN or Inf, replaced by {by}")
-    for name, number in frame.notes.get("outside_data_window", {}).items():
-        parts.append(f"{_pixels(number, name)} outside of the data window, replaced by {_no_hit(name)}")
-    return "; ".join(parts) or None
 
-
-def _pixels(number: int, name: str) -> str:
-    return f"{number} pixel{'s' * (number != 1)} of {name} {'was' if number == 1 else 'were'}"
-
-
-def _no_hit(name: str) -> str:
-    return f"{buffer(name).no_hit:g}, the value of a pixel that hit nothing"
+    frame: Frame
+    exposure: float
+    noisy: Image
+    follows: bool
+    model: Model
+    reasons: tuple[str, ...]
 
 
 class ClipDenoiser:
@@ -109,24 +106,45 @@ class ClipDenoiser:
         clip: Whose frames will come.
         settings: How.
         say: Called with each remark for the user; the caller may show each only once.
+        progress: Called with the number of frames, a fraction, by which the work went on.
 
     Raises:
-        ValueError: Attention or layers are wanted and the model has none to look at.
+        ValueError: Attention is wanted and the model has none to look at.
     """
 
-    def __init__(self, loaded: Loaded, clip: Clip, settings: Settings, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        loaded: Loaded,
+        clip: Clip,
+        settings: Settings,
+        say: Say,
+        progress: Callable[[float], None] = lambda frames: None,
+    ) -> None:
         self.loaded = loaded
         self.model = loaded.model.deploy().eval()
         if settings.attention is not None:
             attentive(loaded.model, loaded.source.reference)
-        if settings.layers:
-            with_layers(loaded.model, loaded.source.reference)
         self.clip = clip
         self.settings = settings
         self.say = say
+        self.progress = progress
+        self._fitting = Fitting(self.model, settings.device, say)
         self._accumulator = Accumulator(**clip.thresholds)
+        self._paces: dict[tuple[int, ...], Pace] = {}
         self._last: Frame | None = None
         self._exposure = 1.0
+
+    def push(self, item: Item, frame: Frame) -> Iterable[tuple[Item, Result]]:
+        """Take the next frame and return what is finished with it.
+
+        Raises:
+            ValueError: As `step`.
+        """
+        return [(item, self.step(frame))]
+
+    def finish(self) -> Iterable[tuple[Item, Result]]:
+        """Return what is left after the last frame."""
+        return ()
 
     def step(self, frame: Frame) -> Result:
         """Denoise the next frame.
@@ -135,40 +153,96 @@ class ClipDenoiser:
             ValueError: A buffer is missing and cannot be derived, the pixel whose attention is wanted lies
                 outside of the frame, or the model returned NaN or Inf.
         """
+        prepared = self.prepare(frame)
+        buffers = self.tensors(prepared)
+        done = 0.0
+
+        def advance(share: float) -> None:
+            nonlocal done
+            self.progress(share - done)
+            done = share
+
+        with torch.inference_mode():
+            denoised = denoise_in_tiles(
+                prepared.model,
+                buffers,
+                budget=self.settings.memory,
+                progress=advance,
+                pace=self.pace(prepared.model, buffers),
+            )
+        aux = {name: image[0] for name, image in (denoised.aux or {}).items()}
+        return self.result(prepared, denoised.color[0], aux, self._attention(buffers))
+
+    def pace(self, model: Model, buffers: Mapping[str, Tensor]) -> Pace | None:
+        """Return when the steps of a method come, None for images so small that it does not matter.
+
+        Measured on a corner of the first image or sequence of its length.
+        """
+        first = buffers[model.inputs[0]]
+        if not hasattr(model, "fused") or first[0, ..., 0, :, :].numel() < LARGE:
+            return None
+        key = (id(model), *first.shape[:-2])
+        if key not in self._paces:
+            side = -(-SAMPLE // model.multiple) * model.multiple
+            corner = {n: t[..., :side, :side] if n in model.inputs else t for n, t in buffers.items()}
+            corner = {n: t.contiguous() for n, t in corner.items()}
+            call = model.clip if isinstance(model, Denoiser) and model.frames else model
+            self._paces[key] = Pace(lambda: call(corner))
+        return self._paces[key]
+
+    def prepare(self, frame: Frame) -> Prepared:
+        """Return the next frame with all that the model reads; raises as `step`."""
         if self.settings.attention is not None:
             inside(self.settings.attention, frame.width, frame.height)
         follows = self._follows(frame)
         previous = self._last.camera if follows and self._last is not None else None
         frame.notes["sequence"] = self.clip.sequence
-        frame = derive(frame, self._wanted(frame), depth_kind=self.clip.depth, previous=previous)
+        model, reasons = self._fitting.fit(frame, self.clip.depth, previous)
+        try:
+            frame = derive(frame, self._wanted(frame, model), depth_kind=self.clip.depth, previous=previous)
+        except ValueError as error:
+            hint = advice(model, self._fitting.has(frame, self.clip.depth, previous))
+            if not hint:
+                raise
+            raise ValueError(f"{error}; {hint}") from error
         exposure = self._choose_exposure(frame, follows)
         self._last = frame
         noisy = self._noisy(frame)
-        frame = self._accumulated(frame)
-        buffers = self._tensors(frame, exposure)
-        with torch.inference_mode():
-            denoised = denoise_tiled(self.model, buffers, budget=self.settings.memory)
-        color = np.ascontiguousarray(denoised[0].float().cpu().numpy().transpose(1, 2, 0))
-        if not np.isfinite(color).all():
+        return Prepared(self._accumulated(frame), exposure, noisy, follows, model, reasons)
+
+    def result(
+        self,
+        prepared: Prepared,
+        color: Tensor,
+        aux: Mapping[str, Tensor],
+        attention: Attention | None = None,
+    ) -> Result:
+        """Return the result of a frame from what the model made of it, (C, H, W) each.
+
+        Raises:
+            ValueError: The model returned NaN or Inf.
+        """
+        frame, image = prepared.frame, _image(color)
+        if not np.isfinite(image).all():
             raise ValueError(
                 f"{frame.label}: the model returned NaN or Inf; train it again or report the frame"
             )
-        result = replace(
+        denoised = replace(
             frame,
-            buffers={"color": color},
-            exposure=exposure,
+            buffers={"color": image},
+            exposure=prepared.exposure,
             accumulated=False,
-            notes=self._provenance(exposure),
+            notes=self._provenance(prepared),
             samples=None,
         )
         return Result(
-            result,
-            exposure,
-            noisy,
+            denoised,
+            prepared.exposure,
+            prepared.noisy,
             self._noisy(frame) if frame.accumulated else None,
             frame.buffers.get("reference"),
-            self._attention(buffers),
-            self._layers(buffers),
+            attention,
+            {name: _image(layer) for name, layer in aux.items()},
         )
 
     def _follows(self, frame: Frame) -> bool:
@@ -179,8 +253,8 @@ class ClipDenoiser:
             and (last.scene, last.index + 1) == (frame.scene, frame.index)
         )
 
-    def _wanted(self, frame: Frame) -> list[str]:
-        names = [name for name in self.model.inputs if name != SAMPLES]
+    def _wanted(self, frame: Frame, model: Model) -> list[str]:
+        names = [name for name in model.inputs if name != SAMPLES]
         temporal = self._accumulates(frame)
         return [*names, "irradiance", "albedo"] if temporal else names
 
@@ -227,22 +301,22 @@ class ClipDenoiser:
             return frame.buffers["irradiance"] * frame.buffers["albedo"]
         return derive(frame, ["color"]).buffers["color"]
 
-    def _tensors(self, frame: Frame, exposure: float) -> dict[str, Tensor]:
-        names = [name for name in self.model.inputs if name != SAMPLES]
+    def tensors(self, prepared: Prepared) -> dict[str, Tensor]:
+        """Return what the model reads of a frame: buffers (1, C, H, W), samples, and the exposure."""
+        frame, model = prepared.frame, prepared.model
+        names = [name for name in model.inputs if name != SAMPLES]
         frame.require(*names)
         buffers: dict[str, Tensor] = {
             name: torch.from_numpy(np.ascontiguousarray(frame.buffers[name].transpose(2, 0, 1)))[None]
             for name in names
         }
-        if SAMPLES in self.model.inputs:
-            assert isinstance(self.model, Denoiser)
-            buffers[SAMPLES] = sample_tensor(frame, self.model)
+        if SAMPLES in model.inputs:
+            buffers[SAMPLES] = sample_tensor(frame, model)
             if lost := dropped(buffers[SAMPLES]):
-                self.say(f"{frame.label}: {lost}")
-        buffers = {name: value.to(self.settings.device) for name, value in buffers.items()}
-        if "exposure" in self.model.frame_numbers:
-            buffers["exposure"] = torch.tensor([exposure], dtype=torch.float32, device=self.settings.device)
-        return buffers
+                self.say(f"{frame.label}: {lost}", "warning")
+        if "exposure" in model.frame_numbers:
+            buffers["exposure"] = torch.tensor([prepared.exposure], dtype=torch.float32)
+        return {name: value.to(self.settings.device) for name, value in buffers.items()}
 
     def _attention(self, buffers: dict[str, Tensor]) -> Attention | None:
         if self.settings.attention is None:
@@ -250,18 +324,20 @@ class ClipDenoiser:
         model = attentive(self.loaded.model, self.loaded.source.reference)
         return attention_of(model, buffers, self.settings.attention)
 
-    def _layers(self, buffers: dict[str, Tensor]) -> LayerImages | None:
-        if not self.settings.layers:
-            return None
-        model = with_layers(self.model, self.loaded.source.reference)
-        return layers_of(model, buffers, self.settings.memory)
-
-    def _provenance(self, exposure: float) -> dict[str, Any]:
-        model = self.loaded.model
+    def _provenance(self, prepared: Prepared) -> dict[str, Any]:
+        model, source = self.loaded.model, self.loaded.source
         facts = {
-            "model": self.loaded.source.reference,
+            "model": source.reference,
             "class": type(model).__name__ if isinstance(model, Denoiser) else model.description.model,
-            "exposure": exposure,
+            "exposure": prepared.exposure,
             DISTRIBUTION: installed_version(DISTRIBUTION),
         }
+        if isinstance(model, Denoiser) and source.class_path and not source.sha256 and source.init_args:
+            facts["options"] = source.init_args
+        if prepared.reasons:
+            facts["instead"] = list(prepared.reasons)
         return {"denoised": facts}
+
+
+def _image(tensor: Tensor) -> Image:
+    return np.ascontiguousarray(tensor.float().cpu().numpy().transpose(1, 2, 0))

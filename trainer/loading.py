@@ -11,34 +11,29 @@ MODEL is one of
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import pickle
 import re
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
-import models
 from models.denoiser import Denoiser
+from trainer.building import FORMS, build, class_path_of, find_class
+from trainer.configs import UsageError
 from trainer.export.artifact import SUFFIXES, Artifact, load_artifact
 from trainer.export.description import Source
+from trainer.options import options_of, parse
 
 Model = Denoiser | Artifact
 RUNS = Path("runs")
 """Where `trainer fit` keeps its runs and the local store."""
-
-FORMS = (
-    "a checkpoint or run folder of `trainer fit`, an MLflow URI (models:/NAME/VERSION, models:/NAME@ALIAS, "
-    "runs:/ID/PATH), an exported .onnx or .ts file, a published checkpoint, or the class name of a denoiser "
-    "without parameters"
-)
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,13 @@ def load_model(model: str, device: str = "cpu", tracking_uri: str | None = None)
     return resolve(model, device, tracking_uri).model
 
 
-def resolve(model: str, device: str = "cpu", tracking_uri: str | None = None) -> Loaded:
+def resolve(
+    model: str,
+    device: str = "cpu",
+    tracking_uri: str | None = None,
+    options: Sequence[str] = (),
+    aux: bool = False,
+) -> Loaded:
     """Return the denoiser that `model` names, and its source.
 
     Files are read without pickle. A checkpoint of a run with averaged weights (EMA, SWA) gives the averaged
@@ -65,20 +66,43 @@ def resolve(model: str, device: str = "cpu", tracking_uri: str | None = None) ->
         device: Where it will run: `cpu`, `cuda`, `cuda:1` …
         tracking_uri: MLflow store of a `models:/` or `runs:/` URI; by default `MLFLOW_TRACKING_URI`, or the
             local store `runs/mlflow.db`.
+        options: Constructor arguments `KEY=VALUE` of a denoiser that is named by its class.
+        aux: Whether it shall return what it made on its way (`Denoised.aux`).
 
     Raises:
+        UsageError: An option is wrong, or the model takes none; or it has nothing to return as `aux`.
         ValueError: The file is damaged or holds another kind of model, the class is unknown or needs weights,
             or the store has no such model.
         FileNotFoundError: Nothing of that name exists; the message lists the forms.
     """
-    if re.match(r"(models|runs):/", model):
-        return _from_mlflow(model, device, tracking_uri)
-    path = Path(model)
-    if path.exists():
-        return _from_path(path, device)
+    path, stored = Path(model), re.match(r"(models|runs):/", model)
+    if stored or path.exists():
+        _refuse(model, options)
+        loaded = _from_mlflow(model, device, tracking_uri) if stored else _from_path(path, device)
+        return _with_aux(loaded) if aux else loaded
     if _looks_like_path(model):
         raise FileNotFoundError(f"--model {model}: no such file; expected {FORMS}")
-    return _from_class_name(model, device)
+    return _from_class_name(model, device, options, aux)
+
+
+def _refuse(model: str, options: Sequence[str]) -> None:
+    """Refuse what only a denoiser that is named by its class can be asked for."""
+    if options:
+        raise UsageError(
+            f"--option {options[0]}: options are for methods that are named by their class, such as NFOR; "
+            f"{model} is a file that holds its settings"
+        )
+
+
+def _with_aux(loaded: Loaded) -> Loaded:
+    """Let a model of a file return what it makes on its way."""
+    if not isinstance(getattr(loaded.model, "aux", None), bool):
+        raise UsageError(
+            f"--aux, --layers: {loaded.source.reference} gives an image and nothing else; checkpoints of "
+            "Layer and Optimized give their layers, NFOR its errors and features"
+        )
+    loaded.model.aux = True  # type: ignore[union-attr]  # checked above
+    return loaded
 
 
 def _looks_like_path(model: str) -> bool:
@@ -169,43 +193,6 @@ def _from_training(checkpoint: dict[str, Any], path: Path, source: Source) -> tu
     return denoiser, replace(source, class_path=str(tree["class_path"]), init_args=arguments)
 
 
-def build(class_path: str, init_args: Mapping[str, Any]) -> Denoiser:
-    """Return a new denoiser of a class, whose nested `{class_path, init_args}` are built as well.
-
-    Raises:
-        ValueError: The class cannot be imported, or is not a denoiser.
-    """
-    cls = _find(class_path)
-    if not issubclass(cls, Denoiser):
-        raise ValueError(f"{class_path} is not a denoiser (models.Denoiser)")
-    arguments = {name: _nested(value) for name, value in init_args.items()}
-    try:
-        return cls(**arguments)
-    except TypeError as error:
-        raise ValueError(f"{class_path} does not take these arguments: {error}") from error
-
-
-def _nested(value: Any) -> Any:
-    if isinstance(value, Mapping) and "class_path" in value:
-        arguments = {name: _nested(item) for name, item in (value.get("init_args") or {}).items()}
-        return _find(str(value["class_path"]))(**arguments)
-    return value
-
-
-def _find(class_path: str) -> type:
-    module, _, name = class_path.rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"unknown class {class_path!r} ({error}); if it belongs to another package, install that package"
-        ) from error
-    # Only networks and their parts may be named by a file; other callables could do anything.
-    if not (isinstance(found, type) and issubclass(found, torch.nn.Module)):
-        raise ValueError(f"{class_path} is not a network")
-    return found
-
-
 def _fill(denoiser: Denoiser, weights: dict[str, Any], path: Path) -> None:
     try:
         denoiser.load_state_dict(weights)
@@ -239,18 +226,19 @@ def _from_authors(
     return denoiser, replace(source, class_path=f"models.{type(denoiser).__name__}")
 
 
-def _from_class_name(name: str, device: str) -> Loaded:
-    class_path = name if "." in name else f"models.{name}"
-    if "." not in name and name not in models.__all__:
-        known = ", ".join(models.__all__)
-        raise FileNotFoundError(f"--model {name}: neither a file nor a denoiser ({known}); expected {FORMS}")
-    denoiser = build(class_path, {})
+def _from_class_name(name: str, device: str, options: Sequence[str], aux: bool) -> Loaded:
+    class_path = class_path_of(name)
+    cls = find_class(class_path)
+    arguments = parse(cls, options)
+    if aux and "aux" not in options_of(cls):
+        raise UsageError(f"--aux, --layers: {name} makes nothing on its way that could be shown; NFOR does")
+    denoiser = build(class_path, {**arguments, **({"aux": True} if aux else {})})
     if next(denoiser.parameters(), None) is not None:
         raise ValueError(
             f"--model {name}: {name} has weights that must be trained; give a checkpoint of it "
             "(`trainer fit` writes runs/…/checkpoints/best.ckpt), a registered model or an exported file"
         )
-    return Loaded(_ready(denoiser, device), Source(reference=name, class_path=class_path))
+    return Loaded(_ready(denoiser, device), Source(name, class_path, arguments))
 
 
 def _ready(denoiser: Denoiser, device: str) -> Denoiser:

@@ -1,8 +1,9 @@
-"""Progress of work that is counted in samples: a bar on a terminal, plain lines elsewhere."""
+"""Progress of work that is counted in samples or frames: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,9 @@ from data.shards.progress import Rate, duration
 
 INTERVAL = 15.0
 """Seconds between plain lines."""
+
+SLOW = 10.0
+"""Seconds after which a frame counts as slow, and at least every so often its progress is told."""
 
 
 class SampleRate(Rate):
@@ -68,3 +72,107 @@ def _lines(title: str, rate: SampleRate) -> Callable[[int, int, str], None]:
             print(f"{title}: {text} ({label})", file=sys.stderr, flush=True)
 
     return update
+
+
+class FrameProgress:
+    """Frames that are done, rate and remaining time, and remarks.
+
+    Within a frame too: the bar moves by fractions, plain lines come at least every `SLOW` seconds. Where a
+    frame takes longer, the hint is told, once.
+
+    Args:
+        total: Number of frames.
+        hint: What could make slow frames faster, empty for nothing.
+    """
+
+    def __init__(self, total: int, hint: str = "") -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.total, self.done, self.hint = total, 0, hint
+        self.start = self._told = self._begun = time.monotonic()
+        self._at = 0.0
+        self._said: set[str] = set()
+        self._over = threading.Event()
+        self._watch = threading.Thread(target=self._look, daemon=True)
+        console = Console(stderr=True)
+        self.bar: Progress | None = None
+        if console.is_terminal:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[count]}"),
+                TimeElapsedColumn(),
+                TimeRemainingColumn(),
+            )
+            self.bar = Progress(*columns, console=console)
+            self.task = self.bar.add_task("denoising", total=total, count=self._count())
+
+    def __enter__(self) -> FrameProgress:
+        """Show the bar."""
+        if self.bar is not None:
+            self.bar.start()
+        self._watch.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Leave the bar as it is."""
+        self._over.set()
+        self._watch.join()
+        if self.bar is not None:
+            self.bar.stop()
+
+    @property
+    def rate(self) -> str:
+        """Frames per second since the start, or seconds per frame where that is more than one."""
+        seconds = max(time.monotonic() - self.start, 1e-9)
+        if 0 < self.done < seconds:
+            return f"{seconds / self.done:.1f} s per frame"
+        return f"{self.done / seconds:.2f} frames/s"
+
+    def say(self, text: str, kind: str = "note", /) -> None:
+        """Show a remark, once."""
+        if text in self._said:
+            return
+        self._said.add(text)
+        if self.bar is not None:
+            self.bar.console.print(f"{kind}: {text}", highlight=False, markup=False, soft_wrap=True)
+        else:
+            print(f"{kind}: {text}", file=sys.stderr, flush=True)
+
+    def within(self, frames: float) -> None:
+        """Go on by a fraction of a frame."""
+        self._at += frames
+        if self.bar is not None:
+            self.bar.update(self.task, completed=min(self._at, self.total))
+
+    def advance(self, name: str) -> None:
+        """Count a frame."""
+        self.done += 1
+        self._at = max(self._at, float(self.done))
+        self._begun = self._told = time.monotonic()
+        if self.bar is not None:
+            self.bar.update(self.task, completed=self._at, description=name, count=self._count())
+        else:
+            print(f"{self.done}/{self.total} {name} ({self.rate})", file=sys.stderr, flush=True)
+
+    def _count(self) -> str:
+        return f"{self.done}/{self.total}" + (f" {self.rate}" if self.done else "")
+
+    def _look(self) -> None:
+        """Tell, from a thread of its own, that work goes on."""
+        while not self._over.wait(0.2):
+            now = time.monotonic()
+            if self.hint and now - self._begun > SLOW:
+                self.say(self.hint)
+            if self.bar is None and now - self._told >= SLOW:
+                self._told = now
+                print(self._line(now - self.start), file=sys.stderr, flush=True)
+
+    def _line(self, seconds: float) -> str:
+        number = min(int(self._at) + 1, self.total)
+        text = f"frame {number}/{self.total}: {duration(seconds)} so far"
+        if self._at <= 0:
+            return text
+        left = seconds * (self.total - self._at) / self._at
+        return f"{text}, {self._at / self.total:.0%} done, about {duration(max(left, 0))} left"

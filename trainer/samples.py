@@ -2,55 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import re
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
-from data.buffers import SAMPLES
 from data.frame import Frame
-from models.denoiser import Denoiser
-from models.layers import Layer, Layered
+from models.layers import Layer
 from models.ops.per_sample import arranged, sample_counts
-from models.tiling import aligned_halo, core_size, numbers_of_frame, tiles
-from trainer.reports.pictures import tone_map
+from trainer.configs import UsageError
+from trainer.loading import Loaded, Model
 
-Radiance = NDArray[np.float32]
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
-
-@dataclass(frozen=True)
-class LayerImages:
-    """What became of the layers of one frame.
-
-    Attributes:
-        unfiltered: Radiance of each layer before filtering (L, H, W, 3), in the units of the input.
-        filtered: After filtering, weighted by alpha.
-        alpha: Opacity of each layer (L, H, W), 0 to 1.
-        composite: The image (H, W, 3).
-    """
-
-    unfiltered: Radiance
-    filtered: Radiance
-    alpha: Radiance
-    composite: Radiance
-
-    def pictures(self, exposure: float) -> dict[str, Image.Image]:
-        """Return name → picture: `layer0-unfiltered`, `layer0-filtered`, `layer0-alpha` …, `composite`."""
-        made = {}
-        for number in range(len(self.alpha)):
-            made[f"layer{number}-unfiltered"] = tone_map(self.unfiltered[number], exposure)
-            made[f"layer{number}-filtered"] = tone_map(self.filtered[number], exposure)
-            gray = np.rint(np.clip(self.alpha[number], 0, 1) * 255).astype(np.uint8)
-            made[f"layer{number}-alpha"] = Image.fromarray(gray)
-        made["composite"] = tone_map(self.composite, exposure)
-        return made
+    from trainer.denoising import Result
 
 
-def sample_tensor(frame: Frame, model: Denoiser) -> Tensor:
+def sample_tensor(frame: Frame, model: Model) -> Tensor:
     """Return the samples of a frame as a model reads them, (1, S, C, H, W).
 
     Raises:
@@ -83,46 +53,37 @@ def dropped(samples: Tensor) -> str | None:
     return f"{text}; {empty} pixels had no other and were filled from around them" if empty else text
 
 
-def with_layers(model: Any, name: str) -> Layer:
-    """Return the model if it has layers.
+def require_layers(loaded: Loaded) -> None:
+    """Check that a model has layers to show.
 
     Raises:
-        ValueError: It has none.
+        UsageError: It has none.
     """
-    if not isinstance(model, Layer):
-        raise ValueError(f"--layers needs a model with layers (Layer, Optimized), and {name} has none")
-    return model
+    if not isinstance(loaded.model, Layer):
+        raise UsageError(
+            f"--layers shows the layers of Layer and Optimized; {loaded.source.reference} is another method"
+        )
 
 
-@torch.inference_mode()
-def layers_of(model: Layer, buffers: dict[str, Tensor], memory: int) -> LayerImages:
-    """Return what becomes of the layers of one frame, in tiles that fit a memory budget.
+def layer_pictures(result: Result) -> dict[str, Image]:
+    """Return name → picture: `layer0_unfiltered`, `layer0_alpha`, `layer0_filtered` …, `composite`.
+
+    And all of them on one sheet, `layers`, as in figure 5 of Munkberg and Hasselgren 2020.
 
     Args:
-        model: A network with layers.
-        buffers: `samples` (1, S, C, H, W) and frame numbers.
-        memory: Bytes.
+        result: With the layers of a `models.Layer` as `aux`.
     """
-    samples, numbers = buffers[SAMPLES], numbers_of_frame(model, buffers)
-    height, width = samples.shape[-2:]
-    bottom, right = -height % model.multiple, -width % model.multiple
-    samples = torch.nn.functional.pad(samples, (0, right, 0, bottom), value=torch.nan)
-    size = (height + bottom, width + right)
-    whole: list[Tensor] = []
-    for piece in tiles(*size, core_size(model, size, memory), aligned_halo(model)):
-        part = samples[(..., *piece.read)].contiguous()
-        made: Layered = model.layered({SAMPLES: part, **numbers})
-        if not whole:
-            whole = [image.new_empty(*image.shape[:-2], *size) for image in made]
-        rows, columns = (
-            slice(c.start - r.start, c.stop - r.start) for c, r in zip(piece.core, piece.read, strict=True)
-        )
-        for target, image in zip(whole, made, strict=True):
-            target[(..., *piece.core)] = image[..., rows, columns]
-    found = [_array(image[0, ..., :height, :width]) for image in whole]
-    return LayerImages(found[0], found[1], found[2][..., 0], found[3])
+    from trainer.reports.layers import layer_picture
+    from trainer.reports.pictures import Panel, grid, sized, tone_map
 
-
-def _array(image: Tensor) -> Radiance:
-    """Return (…, H, W, C) of (…, C, H, W)."""
-    return np.ascontiguousarray(image.float().movedim(-3, -1).cpu().numpy())
+    pictures = {name: layer_picture(name, layer, result.exposure) for name, layer in result.aux.items()}
+    composite = tone_map(result.frame.buffers["color"], result.exposure)
+    rows: dict[str, list[Panel]] = {}
+    for name, picture in pictures.items():
+        layer, _, what = name.partition("_")
+        number = re.sub(r"\D", "", layer)
+        rows.setdefault(layer, []).append(Panel(sized(picture), f"layer {number}, {what}"))
+    last = [Panel(sized(tone_map(result.noisy, result.exposure)), "input, mean of the samples")]
+    last.append(Panel(sized(composite), "composite", f"exposure {result.exposure:.4g}"))
+    sheet = grid([*rows.values(), last], result.frame.label)
+    return {**pictures, "composite": composite, "layers": sheet}

@@ -17,12 +17,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.boxes import exporting
-from models.ops.nlm import Guide, Offset, PatchKernel, PatchWeights, strips
+from models.ops.nlm import Guide, Offset, PatchKernel, PatchWeights, strips, use_fused
 
 EPSILON = 1e-10
 
@@ -55,13 +56,12 @@ def squared_gradient(image: Tensor) -> Tensor:
     The sum of a horizontal and a vertical part, each the smaller square of the two one-sided half
     differences, so that an edge counts on neither of its sides; 0 at the border.
     """
-    total = torch.zeros_like(image)
-    for axis in (-2, -1):
-        half = 0.5 * image.diff(dim=axis)
-        length = image.shape[axis] - 2
-        inner = torch.minimum(half.narrow(axis, 0, length).square(), half.narrow(axis, 1, length).square())
-        total = total + F.pad(inner, (0, 0, 1, 1) if axis == -2 else (1, 1))
-    return total
+    # A repeated border makes one of its differences 0, which is the smaller square.
+    padded = F.pad(image, [1] * 4, mode="replicate")
+    down = (0.5 * padded[..., 1:-1].diff(dim=-2)).square()
+    right = (0.5 * padded[..., 1:-1, :].diff(dim=-1)).square()
+    smaller = torch.minimum(down[..., :-1, :], down[..., 1:, :])
+    return smaller + torch.minimum(right[..., :-1], right[..., 1:])
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,9 @@ def joint_filter(
     guides: Sequence[Guide],
     features: Sequence[Feature],
     kernel: JointKernel,
-    budget: float = 64e6,
+    budget: float | None = None,
+    *,
+    fused: bool | None = None,
 ) -> list[Tensor]:
     """Filter images (B, C, H, W), each with the weights of its own guide and of all features.
 
@@ -93,8 +95,13 @@ def joint_filter(
         guides: One for each image.
         features: Shared by all images.
         kernel: How weights are made.
-        budget: Working memory in bytes, which sets the height of strips.
+        budget: Working memory in bytes, which sets the height of strips; see `models.ops.nlm.strips`.
+        fused: See `models.ops.nlm.use_fused`.
     """
+    parts = [x for f in features for x in (f.image, f.variance, f.spread)]
+    if use_fused(fused, *images, *parts, *(x for guide in guides for x in guide)):
+        pairs = zip(images, guides, strict=True)
+        return [_filter_fused(image, guide, features, kernel) for image, guide in pairs]
     window = kernel.color.window
     height, width = images[0].shape[-2:]
     padded = [[F.pad(x, [window] * 4) for x in (f.image, f.variance, f.spread)] for f in features]
@@ -102,7 +109,7 @@ def joint_filter(
     weights = [PatchWeights([guide], kernel.color) for guide in guides]
     row_bytes = images[0].element_size() * width * images[0].shape[0] * (60 + 20 * len(images))
     results: list[list[Tensor]] = [[] for _ in images]
-    for rows in [(0, height)] if exporting() else strips(height, row_bytes, budget):
+    for rows in [(0, height)] if exporting() else strips(height, row_bytes, budget, images[0].device):
         totals: list[list[Tensor]] = [[] for _ in images]
         for offset in weights[0].offsets:
             distance = _feature_distance(padded, kernel, offset, (rows, width))
@@ -117,6 +124,28 @@ def joint_filter(
         for result, (color, norm) in zip(results, totals, strict=True):
             result.append(color / norm)
     return [torch.cat(result, -2) for result in results]
+
+
+def _filter_fused(image: Tensor, guide: Guide, features: Sequence[Feature], kernel: JointKernel) -> Tensor:
+    from models.ops import fused
+
+    (bandwidth,) = kernel.color.bandwidths
+    rule = fused.Kernel.of(kernel.color, bandwidth, torch.get_num_threads())
+    variance = guide.variance * kernel.color.scale
+    maps = [
+        torch.cat(parts, 1)
+        for parts in zip(*((f.image, f.variance, f.spread) for f in features), strict=True)
+    ]
+    starts = np.cumsum([0, *(f.image.shape[1] for f in features)])
+    numbers = np.array([kernel.bandwidth**2, EPSILON, kernel.combine == "product"], np.float32)
+    result = []
+    for b in range(image.shape[0]):
+        of_b = torch.stack([m[b] for m in maps]).numpy() if maps else np.zeros((3, 0, 1, 1), np.float32)
+        own, guides, variances = (x[b][None].numpy() for x in (image[:, None], guide.image, variance))
+        joined = fused.FeatureMaps(of_b, starts, numbers)
+        found = fused.filter_images(own, guides, variances, rule, features=joined)
+        result.append(torch.from_numpy(found[0]))
+    return torch.stack(result)
 
 
 def _place(

@@ -31,9 +31,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.boxes import box_sum_valid, exporting
+from models.pace import tick
 
 CENTRE_FLOOR = 1e-4
 """Least weight of a pixel in its own window; it matters only where a variance is not a number."""
+
+UNROLLED = (
+    "it visits hundreds of window offsets one by one, which a graph would hold as so many copies of its "
+    "operations; use it from Python or with `trainer denoise`"
+)
+"""Why methods made of these operations are not exported."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +160,7 @@ class PatchWeights:
                 mean = mean.amax(1, keepdim=True)
             weight = torch.exp(-mean.clamp_min(0.0)) * (down.reached[:, None] * across.reached)
             result.append(weight.clamp_min(CENTRE_FLOOR) if offset == (0, 0, 0) else weight)
+        tick((stop - start) / self.size[0])
         return result
 
     def _differences(self, offset: Offset, rows: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -186,14 +194,20 @@ class _Axis(NamedTuple):
     reached: Tensor
 
 
-def strips(height: int, row_bytes: float, budget: float) -> list[tuple[int, int]]:
+def strips(
+    height: int, row_bytes: float, budget: float | None, device: torch.device
+) -> list[tuple[int, int]]:
     """Cut rows 0 … height - 1 into equal strips that fit a budget.
 
     Args:
         height: Rows of the image.
         row_bytes: Working memory per row.
-        budget: Working memory in bytes; a strip has at least 8 rows whatever it is.
+        budget: Working memory in bytes; a strip has at least 8 rows whatever it is. None: 64 MB on a CPU,
+            whose cache larger strips leave, and 4 GB on other devices, where every call costs.
+        device: Where the image is.
     """
+    if budget is None:
+        budget = 64e6 if device.type == "cpu" else 4e9
     rows = max(8, int(budget / row_bytes))
     if rows >= height:
         return [(0, height)]
@@ -206,7 +220,7 @@ def nlm_filter(
     images: Tensor,
     guides: Sequence[Guide],
     kernel: PatchKernel,
-    budget: float = 64e6,
+    budget: float | None = None,
     *,
     neighbours: Sequence[Tensor] | None = None,
     centre: int = 0,
@@ -219,7 +233,7 @@ def nlm_filter(
             the guide, or anything where the kernel gives one weight for all channels.
         guides: Of one frame, or of consecutive frames.
         kernel: Has one bandwidth.
-        budget: Working memory in bytes, which sets the height of the strips that are worked on.
+        budget: Working memory in bytes, which sets the height of the strips that are worked on; see `strips`.
         neighbours: `images` of every frame, where the window spans frames.
         centre: Which frame is filtered.
         fused: See `use_fused`.
@@ -235,7 +249,7 @@ def nlm_filter(
     planes = 4 * images[..., 0, 0].numel() + 8 * guides[0].image[..., 0, 0].numel()
     row_bytes = images.element_size() * width * planes
     result = []
-    for start, stop in [(0, height)] if exporting() else strips(height, row_bytes, budget):
+    for start, stop in [(0, height)] if exporting() else strips(height, row_bytes, budget, images.device):
         total: Tensor | None = None
         norm: Tensor | None = None
         for offset in weights.offsets:

@@ -36,9 +36,11 @@ def finer(image: Tensor) -> Tensor:
 
 def _down(image: Tensor, taps: list[float]) -> Tensor:
     margin = len(taps) // 2 - 1
-    padded = F.pad(image, [margin] * 4, mode="replicate")
+    result = F.pad(image, [margin] * 4, mode="replicate")
     for axis in (-2, -1):
-        length = padded.shape[axis] - 2 * margin
-        parts = [tap * torch.ops.aten.slice(padded, axis, i, i + length - 1, 2) for i, tap in enumerate(taps)]
-        padded = torch.stack(parts).sum(0)
-    return padded
+        # Ends are counted from the far side: a traced graph takes any size.
+        steps = (slice(i, i + 1 - len(taps) or None, 2) for i in range(len(taps)))
+        others = (slice(None),) * (-1 - axis)
+        parts = [tap * result[(..., step, *others)] for tap, step in zip(taps, steps, strict=True)]
+        result = torch.stack(parts).sum(0)
+    return result

@@ -32,8 +32,12 @@ from torch import Tensor
 from models.ops.boxes import exporting
 from models.ops.nlm import Guide, Offset, PatchKernel, PatchWeights, guide_parts, strips, use_fused
 
-RIDGE = 1e-6
+RIDGE = 5e-7
 NOISE = 2e-6
+_TOGETHER = 16
+"""Offsets whose products are added in the precision of the images before float64 takes over: added one by
+one, 361 float32 numbers lose as many digits as the ridge leaves."""
+
 _TINY = 1e-30
 Place = tuple[EllipsisType, slice, slice]
 _POSITIONS = 3
@@ -59,7 +63,7 @@ def collaborative_regression(
     frames: Sequence[Sample],
     kernel: PatchKernel,
     reach: int = 0,
-    budget: float = 64e6,
+    budget: float | None = None,
     *,
     fused: bool | None = None,
 ) -> list[list[Tensor]]:
@@ -69,7 +73,7 @@ def collaborative_regression(
         frames: One for a still, or consecutive ones.
         kernel: Gives one weight for all channels (`least` or `mean`), for any number of bandwidths.
         reach: Frames before and after its own that a window spans; the frame index is a regressor then.
-        budget: Working memory in bytes beside inputs and results; sets the height of strips.
+        budget: Working memory in bytes beside inputs and results; see `models.ops.nlm.strips`.
         fused: See `models.ops.nlm.use_fused`.
 
     Returns:
@@ -88,7 +92,7 @@ def collaborative_regression(
     for centre in range(len(frames)):
         near = range(max(0, centre - reach), min(len(frames), centre + reach + 1))
         weights = PatchWeights([frames[i].guide for i in near], kernel, centre - near[0])
-        for rows in [(0, height)] if exporting() else strips(height, row_bytes, budget):
+        for rows in [(0, height)] if exporting() else strips(height, row_bytes, budget, joined[0].device):
             strip = _Strip([padded[i] for i in near], centre - near[0], rows, window)
             _regress(strip, weights, [[totals[k][i] for i in near] for k in range(count)])
     inner = (..., slice(window, window + height), slice(window, window + width))
@@ -100,7 +104,7 @@ def _numbers(frames: Sequence[Sample], kernel: PatchKernel, reach: int) -> int:
     regressors = 1 + _POSITIONS + frames[0].features.shape[1]
     offsets = (2 * kernel.window + 1) ** 2 * min(len(frames), 2 * reach + 1)
     sums = regressors * (regressors + 1) // 2 + 3 * regressors
-    return len(kernel.bandwidths) * (offsets + sums) + 3 * sums + 60
+    return len(kernel.bandwidths) * (offsets + 3 * sums) + 3 * sums + 60
 
 
 class _Strip:
@@ -134,12 +138,17 @@ def _regress(strip: _Strip, weights: PatchWeights, totals: list[list[Tensor]]) -
     """Add the predictions of the windows around a strip to the totals: weighted colours and weights."""
     kept = []
     sums: list[list[Tensor]] = [[] for _ in totals]
-    for offset in weights.offsets:
-        z = strip.regressors(offset)
-        of_offset = weights.at(offset, strip.rows)
-        kept.append(of_offset)
-        for weight, into in zip(of_offset, sums, strict=True):
-            _add_products(into, weight * z[:, :-3], z)
+    for first in range(0, len(weights.offsets), _TOGETHER):
+        parts: list[list[Tensor]] = [[] for _ in totals]
+        for offset in weights.offsets[first : first + _TOGETHER]:
+            z = strip.regressors(offset)
+            of_offset = weights.at(offset, strip.rows)
+            kept.append(of_offset)
+            for weight, into in zip(of_offset, parts, strict=True):
+                _add_products(into, weight * z[:, :-3], z)
+        for into, part in zip(sums, parts, strict=True):
+            wide = [rows.double() for rows in part]
+            into[:] = [x.add_(y) for x, y in zip(into, wide, strict=True)] if into else wide
     models = [_solve(into, strip) for into in sums]
     del sums
     for offset, of_offset in zip(weights.offsets, kept, strict=True):
@@ -163,8 +172,7 @@ def _add_products(sums: list[Tensor], weighted: Tensor, z: Tensor) -> None:
 
 def _solve(sums: list[Tensor], strip: _Strip) -> Tensor:
     """Return the coefficients of the fitted models, (B, 3, R, rows, W)."""
-    dtype, size = sums[0].dtype, len(sums)
-    rows = [s.double() for s in sums]
+    rows, size = sums, len(sums)
     total = rows[0][:, :1]
     mean = rows[0] / total
     known = strip.known
@@ -180,7 +188,7 @@ def _solve(sums: list[Tensor], strip: _Strip) -> Tensor:
     constant = mean[:, size:]
     for i, slope in enumerate(slopes, 1):
         constant = constant - mean[:, i : i + 1] * slope
-    return torch.stack([constant, *slopes], 2).to(dtype)
+    return torch.stack([constant, *slopes], 2).to(strip.origin.dtype)
 
 
 def solve_covariances(covariance: list[Tensor], ridge: list[Tensor]) -> list[Tensor]:

@@ -25,6 +25,7 @@ MODULES = (
     *("rendering", "procedural"),
     *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "stills_quality"),
     "splat",
+    *("nfor", "nfor_growth", "nlm", "classical_quality", "flicker"),
 )
 RESULTS = Path("bench") / "results.json"
 

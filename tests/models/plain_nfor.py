@@ -12,6 +12,9 @@ import scipy.linalg
 
 from tests.models.plain_nlm import Array, nlm, patch_distance, weight, window
 
+FLOAT32 = 2.0**-23
+"""Its epsilon."""
+
 
 @dataclass(frozen=True)
 class Radii:
@@ -42,14 +45,14 @@ class Steps:
 def least_squares(design: Array, target: Array, weights: Array) -> Array:
     """Return the basic solution of a column-pivoted QR.
 
-    Columns are dropped where the public implementation's solver stops: their remaining norm is below the
-    float32 epsilon of the largest, divided by the root of the number of rows.
+    The public implementation's solver works in float32 and stops at the first column whose remaining norm is
+    below epsilon times the largest norm, but for the number of rows that are left.
     """
-    precision = 1.2e-7 / len(design) ** 0.5
     root = np.sqrt(weights)[:, None]
     q, r, order = scipy.linalg.qr(design * root, mode="economic", pivoting=True)
-    diagonal = np.abs(np.diag(r))
-    rank = int((diagonal > precision * diagonal[0]).sum())
+    diagonal, rows = np.abs(np.diag(r)), len(design)
+    left = np.sqrt((rows - np.arange(len(diagonal))) / rows)
+    rank = len(np.trim_zeros(np.cumprod(diagonal >= FLOAT32 * diagonal[0] * left)))
     solution = np.zeros((design.shape[1], target.shape[1]))
     right = q[:, :rank].T @ (target * root)
     solution[order[:rank]] = scipy.linalg.solve_triangular(r[:rank, :rank], right)

@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from models import WSKP
-from models.tiling import core_size, denoise_tiled, tiles
-from tests.models.frames import largest_relative, random_buffers
+from models import NFOR, WSKP
+from models.tiling import core_size, denoise_in_tiles, denoise_tiled, tiles, times_read
+from tests.models.frames import largest_relative, random_buffers, split_buffers
 
 
 class Pyramid:
@@ -137,3 +137,50 @@ def test_buffers_of_different_size_are_refused() -> None:
     buffers = {**random_buffers(1, 16, 16), "depth": torch.ones(1, 1, 16, 17)}
     with pytest.raises(ValueError, match="depth 17x16"):
         denoise_tiled(WSKP(), buffers)
+
+
+@pytest.fixture
+def narrow() -> NFOR:
+    """NFOR with windows so small that its halo fits several times into a small image."""
+    return NFOR(features=("normal",), window=1, patch=1, prefilter_window=1, final_window=1, aux=True)
+
+
+def test_nfor_tiled_equals_untiled_with_all_that_it_made_on_its_way(narrow: NFOR) -> None:
+    buffers = {**split_buffers(2, 53, 47), "exposure": torch.tensor([1.0, 0.3])}
+    shares: list[float] = []
+    with torch.inference_mode():
+        whole = narrow(buffers)
+        tiled = denoise_in_tiles(narrow, buffers, tile=16, progress=shares.append)
+    assert largest_relative(tiled.color, whole.color) < 1e-5
+    assert tiled.aux is not None
+    assert whole.aux is not None
+    assert tiled.aux.keys() == whole.aux.keys() == {"normal", "error_k0.5", "error_k1", "selection"}
+    for name, layer in whole.aux.items():
+        assert largest_relative(tiled.aux[name], layer) < 1e-5
+    assert len(shares) == 12
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1)
+
+
+def test_a_clip_tiled_equals_the_clip_untiled() -> None:
+    method = NFOR(features=(), frames=1, window=1, patch=0, aux=True)
+    stills = [split_buffers(1, 36, 34, seed) for seed in range(2)]
+    buffers = {name: torch.stack([s[name] for s in stills], 1) for name in method.inputs}
+    with torch.inference_mode():
+        whole, tiled = method.clip(buffers), denoise_in_tiles(method, buffers, tile=18)
+    assert tiled.color.shape == (1, 2, 3, 36, 34)
+    assert largest_relative(tiled.color, whole.color) < 1e-5
+    assert whole.aux is not None
+    assert tiled.aux is not None
+    assert largest_relative(tiled.aux["error_k1"], whole.aux["error_k1"]) < 1e-4
+
+
+@pytest.mark.parametrize("budget", [30e6, 150e6, 400e6])
+def test_a_large_halo_is_read_about_nine_times_at_most_and_once_where_memory_allows(budget: float) -> None:
+    method, size = NFOR(), (720, 1280)
+    assert times_read(method, size, core_size(method, size, int(budget))) < 10
+    assert core_size(method, size, size[0] * size[1] * method.bytes_per_pixel) == size
+
+
+def test_without_layers_there_is_no_aux() -> None:
+    assert denoise_in_tiles(WSKP(), random_buffers(1, 40, 40), tile=16).aux is None

@@ -33,7 +33,10 @@ def small(kind: type = Layer, **arguments: Any) -> Any:
 
 
 def denoise(monkeypatch: pytest.MonkeyPatch, model: Any, output: Path, *options: str) -> int:
-    monkeypatch.setattr(trainer.loading, "resolve", lambda *_: Loaded(model, Source("small")))
+    def resolve(*_: object, aux: bool, **__: object) -> Loaded:
+        return Loaded(model, Source("small"))
+
+    monkeypatch.setattr(trainer.loading, "resolve", resolve)
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
     arguments = [str(FRAME), "--model", "small", "--output", str(output), *options]

@@ -177,6 +177,17 @@ def test_a_denoiser_without_frame_numbers_or_parameters_is_exported(tmp_path: Pa
     assert torch.allclose(load_artifact(path)({"color": color}).color, Blur()({"color": color}).color)
 
 
+UNROLLED = {"NFOR", "NLM", "JointNLM", "MultiScaleNLM"}
+"""Methods whose graph would be hundreds of copies of the same operations."""
+
+
+@pytest.mark.parametrize("name", sorted(UNROLLED))
+def test_methods_of_hundreds_of_offsets_are_refused_with_the_reason(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} cannot be exported: it visits hundreds of window offsets"):
+        export(make(name), tmp_path / "net.onnx")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, format: str) -> None:
     net = models.JointBilateral(radius=2)
@@ -184,7 +195,7 @@ def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, f
 
 
 @pytest.mark.parametrize("format", FORMATS)
-@pytest.mark.parametrize("name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"}))
+@pytest.mark.parametrize("name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"} - UNROLLED))
 def test_every_network_is_exported_and_takes_any_size(tmp_path: Path, name: str, format: str) -> None:
     torch.manual_seed(3)
     net = make(name)

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 import models
-from models import WSKP
+from models import NFOR, WSKP
 from trainer.commands import models as command
+from trainer.options import options_of
 
 
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
@@ -55,3 +56,26 @@ def test_registered_versions_are_listed_with_their_aliases(
 
 def test_the_reference_is_the_paragraph_with_the_doi() -> None:
     assert command.reference(WSKP).startswith("Hangming Fan")
+
+
+def test_the_options_of_a_method_are_listed_with_defaults_types_and_meaning(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = run(capsys, monkeypatch, "CrossBilateral")
+    assert "  radius=6   (a whole number)\n      Half the window." in out
+    assert "trainer denoise --model CrossBilateral --option OPTION=VALUE" in out
+    assert "models.WSKP" not in out
+    out = run(capsys, monkeypatch, "NFOR")
+    assert "preset=public   (public or paper)" in out
+    assert "features=normal,albedo,depth   (words with commas between)" in out
+    for option in options_of(NFOR).values():
+        assert option.meaning, option.name
+
+
+def test_an_unknown_denoiser_is_named_with_the_nearest(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(FileNotFoundError, match=r"NFR: no such denoiser; did you mean NFOR\?"):
+        run(capsys, monkeypatch, "NFR")
+    with pytest.raises(FileNotFoundError, match=r"jointnlm: no such denoiser; did you mean JointNLM\?"):
+        run(capsys, monkeypatch, "jointnlm")

@@ -5,19 +5,15 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
-
     from trainer.clips import Item
-    from trainer.denoising import Result
+    from trainer.inputs import Say
 
 HELP = "denoise EXR files and sequences"
 _UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
@@ -39,9 +35,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "runs:/ID/PATH), exported .onnx or .ts file, published checkpoint, or class name of a denoiser "
         "without parameters",
     )
+    parser.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of a method that is named by its class, such as window=5 or features=normal,albedo; "
+        "may be repeated (`trainer models NFOR` lists those of NFOR)",
+    )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the results")
     parser.add_argument(
         "--png", action="store_true", help="also write tone-mapped pictures, and comparisons with a reference"
+    )
+    parser.add_argument(
+        "--aux",
+        action="store_true",
+        help="also write what the method made on its way (NFOR: estimated errors, selection map, filtered "
+        "features; Layer, Optimized: layers) to NAME_aux.exr, and with --png a picture of it",
+    )
+    parser.add_argument(
+        "--layers",
+        action="store_true",
+        help="also write NAME_layers, a folder of pictures: every layer before and after filtering, its "
+        "opacity, the composite, and all on one sheet (Layer, Optimized)",
     )
     parser.add_argument(
         "--attention",
@@ -64,19 +80,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_bytes,
         default=_bytes("2GB"),
         metavar="SIZE",
-        help="memory that the model may take, such as 2GB or 500MB; larger images are tiled (default: 2GB)",
+        help="memory that the model may take, such as 2GB or 500MB; larger images are tiled, and sequences "
+        "cut, which changes no result (default: 2GB)",
     )
     parser.add_argument(
         "--device", default="cpu", metavar="DEVICE", help="cpu, cuda, cuda:1 … (default: cpu)"
     )
     parser.add_argument(
         "--no-accumulate", action="store_true", help="do not accumulate sequences over preceding frames"
-    )
-    parser.add_argument(
-        "--layers",
-        action="store_true",
-        help="write a folder of pictures of every layer before and after filtering, and its opacity (Layer, "
-        "Optimized)",
     )
     parser.add_argument("--force", action="store_true", help="replace results that are already there")
 
@@ -94,40 +105,46 @@ def run(args: argparse.Namespace) -> int:
     if args.attention is not None and not args.png:
         raise UsageError("--attention draws a picture: expected --png with it")
     from trainer.clips import find_clips
-    from trainer.denoising import ClipDenoiser, Settings, replaced_pixels
+    from trainer.denoising import Settings
+    from trainer.inputs import replaced_pixels
+    from trainer.kernels import Kernels
     from trainer.loading import resolve
     from trainer.outputs import make_folder, refuse_existing
+    from trainer.progress import FrameProgress
+    from trainer.results import Wanted, write
+    from trainer.samples import require_layers
+    from trainer.sequences import denoiser_of
 
     _check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
-    wanted = _Wanted(args.output, args.png, args.attention is not None, args.layers)
+    wanted = Wanted(args.output, args.png, args.attention is not None, args.aux, args.layers)
     outputs = [path for item in items for path in wanted.paths(item).values()]
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
     make_folder(args.output)
-    loaded = resolve(args.model, args.device)
+    loaded = resolve(args.model, args.device, options=args.option, aux=args.aux or args.layers)
     number = args.exposure if isinstance(args.exposure, float) else None
     settings = Settings(
-        number,
-        args.exposure == "auto",
-        not args.no_accumulate,
-        args.memory,
-        args.device,
-        args.attention,
-        args.layers,
+        number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device, args.attention
     )
-    with _progress(len(items)) as progress:
+    if args.layers:
+        require_layers(loaded)
+    kernels = Kernels(loaded.model, args.device)
+    with FrameProgress(len(items), kernels.hint) as progress, kernels.announced(progress.say):
         for clip in clips:
-            denoiser = ClipDenoiser(loaded, clip, settings, progress.say)
+            denoiser = denoiser_of(loaded, clip, settings, progress)
             for item in clip.items:
                 with _naming(item, progress.say):
                     frame = item.read()
                     if replaced := replaced_pixels(frame):
                         progress.say(f"{item.label}: {replaced}")
-                    result = denoiser.step(frame)
-                _write(result, wanted.paths(item))
-                progress.advance(item)
+                    results = list(denoiser.push(item, frame))
+                    if item is clip.items[-1]:
+                        results += denoiser.finish()
+                for done, result in results:
+                    write(result, wanted.paths(done))
+                    progress.advance(done.name)
     print(
         f"{len(items)} frame{'s' * (len(items) != 1)} written to {args.output} ({progress.rate})",
         file=sys.stderr,
@@ -165,27 +182,6 @@ def _bytes(text: str) -> int:
     return int(float(match[1]) * _UNITS[match[2]])
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """Which results are written, and where."""
-
-    folder: Path
-    png: bool
-    attention: bool
-    layers: bool = False
-
-    def paths(self, item: Item) -> dict[str, Path]:
-        """Return the files of a frame by what they show; those of pictures only where they are wanted."""
-        suffixes = {"exr": ".exr"}
-        if self.png:
-            suffixes |= {"denoised": ".png", "comparison": "_comparison.png"}
-        if self.attention:
-            suffixes["attention"] = "_attention.png"
-        if self.layers:
-            suffixes["layers"] = "_layers"
-        return {kind: self.folder / f"{item.name}{suffix}" for kind, suffix in suffixes.items()}
-
-
 def _refuse_inputs(items: list[Item], outputs: list[Path]) -> None:
     sources = {item.source.resolve() for item in items if item.source is not None}
     for path in outputs:
@@ -213,7 +209,7 @@ def _check_device(device: str) -> None:
 
 
 @contextmanager
-def _naming(item: Item, say: Callable[[str], None]) -> Iterator[None]:
+def _naming(item: Item, say: Say) -> Iterator[None]:
     """Name the frame in every error, and show warnings of readers as remarks."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -226,93 +222,3 @@ def _naming(item: Item, say: Callable[[str], None]) -> Iterator[None]:
             raise kind(text if item.label in text else f"{item.label}: {text}") from error
     for warning in caught:
         say(str(warning.message))
-
-
-def _write(result: Result, paths: dict[str, Path]) -> None:
-    from data.exr import write_frame
-    from trainer.outputs import replacing
-
-    exr = paths["exr"]
-    exr.parent.mkdir(parents=True, exist_ok=True)
-    pictures = _pictures(result) if "denoised" in paths else {}
-    for kind, image in pictures.items():
-        with replacing(paths[kind]) as temporary:
-            image.save(temporary)
-    if result.layers is not None:
-        paths["layers"].mkdir(exist_ok=True)
-        for name, image in result.layers.pictures(result.exposure).items():
-            with replacing(paths["layers"] / f"{name}.png") as temporary:
-                image.save(temporary)
-    write_frame(result.frame, exr)  # last: a frame with its EXR is finished
-
-
-def _pictures(result: Result) -> dict[str, Picture]:
-    from trainer.reports.attention import attention_picture
-    from trainer.reports.pictures import comparison, tone_map
-
-    color, exposure, label = result.frame.buffers["color"], result.exposure, result.frame.label
-    pictures = {"denoised": tone_map(color, exposure)}
-    if result.reference is not None:
-        title = f"{label}, exposure {exposure:.4g}"
-        pictures["comparison"] = comparison(
-            result.noisy, result.accumulated, color, result.reference, exposure, title
-        )
-    if result.attention is not None:
-        pictures["attention"] = attention_picture(color, exposure, result.attention, label)
-    return pictures
-
-
-class _Progress:
-    """A bar with rate and remaining time on a terminal, plain lines otherwise."""
-
-    def __init__(self, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self.total, self.done, self.start = total, 0, time.monotonic()
-        self.said: set[str] = set()
-        console = Console(stderr=True)
-        self.bar: Progress | None = None
-        if console.is_terminal:
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[rate]}"),
-                TimeRemainingColumn(),
-            )
-            self.bar = Progress(*columns, console=console)
-            self.task = self.bar.add_task("denoising", total=total, rate="")
-
-    @property
-    def rate(self) -> str:
-        """Frames per second since the start."""
-        return f"{self.done / max(time.monotonic() - self.start, 1e-9):.2f} frames/s"
-
-    def say(self, text: str) -> None:
-        """Show a remark, once."""
-        if text in self.said:
-            return
-        self.said.add(text)
-        if self.bar is not None:
-            self.bar.console.print(f"note: {text}", highlight=False, markup=False, soft_wrap=True)
-        else:
-            print(f"note: {text}", file=sys.stderr)
-
-    def advance(self, item: Item) -> None:
-        """Count a frame."""
-        self.done += 1
-        if self.bar is not None:
-            self.bar.update(self.task, advance=1, description=item.name, rate=self.rate)
-        else:
-            print(f"{self.done}/{self.total} {item.name} ({self.rate})", file=sys.stderr)
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[_Progress]:
-    progress = _Progress(total)
-    if progress.bar is None:
-        yield progress
-        return
-    with progress.bar:
-        yield progress

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
+    from rich.console import Console
 
-HELP = "list denoisers and registered models"
+HELP = "list denoisers and registered models, or the options of denoisers"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options."""
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="print the options of these denoisers, such as NFOR, instead of the lists",
+    )
     parser.add_argument(
         "--tracking-uri",
         metavar="URI",
@@ -22,9 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print both lists; returns the exit code.
+    """Print both lists, or the options of the named denoisers; returns the exit code.
 
     Raises:
+        FileNotFoundError: There is no denoiser of that name.
         ValueError: A store was named and cannot be read.
     """
     from rich.console import Console
@@ -33,9 +42,13 @@ def run(args: argparse.Namespace) -> int:
     from trainer.loading import model_store
 
     console = Console()
+    if args.names:
+        _print_options(console, args.names)
+        return 0
     console.print(denoiser_table())
     for name in models.__all__:
         console.print(f"models.{name}: {reference(getattr(models, name))}", highlight=False)
+    console.print("`trainer models NAME` prints the options of a denoiser.\n", highlight=False)
     try:
         store = model_store(args.tracking_uri)
     except ValueError as error:
@@ -43,6 +56,36 @@ def run(args: argparse.Namespace) -> int:
         return 0
     console.print(registered_table(store))
     return 0
+
+
+def _print_options(console: Console, names: list[str]) -> None:
+    from trainer.building import class_path_of, find_class
+
+    for name in names:
+        class_path = class_path_of(name.removeprefix("models."), "trainer models")
+        cls = find_class(class_path)
+        console.print(f"{class_path}: {(inspect.getdoc(cls) or '').splitlines()[0]}", highlight=False)
+        for line in option_lines(cls, console.width):
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+        trained = next(cls().parameters(), None) is not None
+        use = (
+            "in a configuration: --model.init_args.net.init_args.OPTION VALUE"
+            if trained
+            else f"trainer denoise --model {name} --option OPTION=VALUE …"
+        )
+        console.print(f"{use}\n", highlight=False, markup=False)
+
+
+def option_lines(cls: type, width: int) -> list[str]:
+    """Return for every argument of a denoiser's constructor its default, what it may be, what it means."""
+    from trainer.options import options_of
+
+    lines = []
+    for option in options_of(cls).values():
+        lines.append(f"  {option.name}={option.shown_default}   ({option.expected})")
+        lines += textwrap.wrap(option.meaning, min(width, 100) - 8, initial_indent=" " * 6,
+                               subsequent_indent=" " * 6)  # fmt: skip
+    return lines
 
 
 def denoiser_table() -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,8 +34,12 @@ class Artifact:
 
     Attributes:
         description: The metadata of the file.
-        inputs, frame_numbers, halo, multiple, temporal, per_sample: As declared by the denoiser.
+        inputs, frame_numbers, halo, multiple, temporal, per_sample, samples, fill: As declared by the denoiser.
+        frames, frame_halo: 0: exported files take images.
     """
+
+    frames = 0
+    frame_halo = 0
 
     def __init__(self, description: Description, runtime: Runtime, name: str) -> None:
         self.description = description
@@ -46,6 +50,8 @@ class Artifact:
         self.multiple = description.multiple
         self.temporal = description.temporal
         self.per_sample = description.per_sample
+        self.samples = description.samples
+        self.fill = description.fill
         self._runtime = runtime
 
     def __call__(self, buffers: Mapping[str, Tensor]) -> Denoised:
@@ -57,6 +63,9 @@ class Artifact:
         self.check(buffers)
         known = (*self.inputs, *self.frame_numbers)
         return Denoised(self._runtime({name: buffers[name] for name in known if name in buffers}))
+
+    def instead(self, available: Collection[str]) -> None:
+        """Return nothing: an exported file has one form only."""
 
     def measure(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the frame numbers that need the whole frame, as the vocabulary defines them."""

@@ -71,6 +71,8 @@ class Description:
     output: str = "color"
     version: int = FORMAT_VERSION
     versions: dict[str, str] = field(default_factory=dict)
+    samples: tuple[str, ...] = ()
+    fill: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """Return the description as one JSON object."""
@@ -94,8 +96,8 @@ class Description:
             if parity is not None:
                 sizes = tuple((int(b), int(h), int(w)) for b, h, w in parity.pop("sizes"))
                 parity = Parity(sizes=sizes, **parity)
-            for name in ("inputs", "frame_numbers"):
-                values[name] = tuple(values[name])
+            for name in ("inputs", "frame_numbers", "samples"):
+                values[name] = tuple(values.get(name, ()))
             return cls(source=Source(**values.pop("source")), parity=parity, **values)
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
@@ -121,6 +123,8 @@ def describe(denoiser: Denoiser, format: str, source: Source | None) -> Descript
         multiple=int(denoiser.multiple),
         temporal=bool(denoiser.temporal),
         per_sample=bool(denoiser.per_sample),
+        samples=tuple(denoiser.samples),
+        fill=dict(denoiser.fill),
         source=source,
         format=format,
         output=output_name(tuple(denoiser.inputs)),

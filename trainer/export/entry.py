@@ -59,6 +59,13 @@ def prepare(denoiser: Denoiser) -> Denoiser:
         raise ValueError(
             f"{type(denoiser).__name__} reads single samples; such models cannot be exported yet"
         )
+    if denoiser.no_export:
+        raise ValueError(f"{type(denoiser).__name__} cannot be exported: {denoiser.no_export}")
+    if denoiser.frames:
+        raise ValueError(
+            f"{type(denoiser).__name__} reads sequences where `frames` is not 0, which exported files "
+            "cannot; export it with frames=0"
+        )
     return copy.deepcopy(denoiser).deploy().eval().float().cpu().requires_grad_(False)
 
 

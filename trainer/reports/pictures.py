@@ -21,6 +21,7 @@ ERROR_SCALE = 0.25
 """Difference of display values (0 to 1) at which an error map reaches its brightest colour. It is fixed, so
 that maps of different epochs and methods can be compared."""
 
+_ERROR = ("absolute difference", "of display values,", "mean of R, G, B")
 _BACKGROUND, _TEXT, _FAINT = (24, 24, 27), (236, 236, 238), (161, 161, 170)
 _SMALLEST, _WIDEST = 256, 640
 """Widths between which a panel is shown: crops are enlarged in whole steps, frames are reduced."""
@@ -109,15 +110,15 @@ def comparison(
     top = []
     for name, image in shown.items():
         caption = "" if reference is None else _score(name, image, reference, exposure)
-        top.append(Panel(_sized(tone_map(image, exposure)), name, caption))
+        top.append(Panel(sized(tone_map(image, exposure)), name, caption))
     rows = [top]
     if reference is not None:
         maps = [
-            Panel(_sized(error_map(image, reference, exposure)), f"error of {name}")
+            Panel(sized(error_map(image, reference, exposure)), f"error of {name}")
             for name, image in shown.items()
             if name != "reference"
         ]
-        rows.append([*maps, Panel(_legend(top[0].picture.size))])
+        rows.append([*maps, Panel(legend(top[0].picture.size, ERROR_SCALE, _ERROR))])
     return grid(rows, title or f"exposure {exposure:.4g}")
 
 
@@ -161,7 +162,8 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def _sized(picture: Image.Image) -> Image.Image:
+def sized(picture: Image.Image) -> Image.Image:
+    """Return a picture as large as panels are: crops enlarged in whole steps, frames reduced."""
     width, height = picture.size
     if width > _WIDEST:
         return picture.resize((_WIDEST, max(1, round(height * _WIDEST / width))), Image.Resampling.BOX)
@@ -187,22 +189,31 @@ def _score(name: str, image: Array, reference: Array, exposure: float) -> str:
     return f"{text}   SSIM {float(ssim_wskp(output, target)):.3f}"
 
 
-def _legend(size: tuple[int, int]) -> Image.Image:
-    """Return the colour bar of the error maps, upright, as large as a panel."""
+def legend(size: tuple[int, int], top: float, lines: tuple[str, ...]) -> Image.Image:
+    """Return the colour bar of `false_color`, upright, as large as a panel.
+
+    Args:
+        size: Width and height.
+        top: The value of the brightest colour.
+        lines: What the values are, beside the bar where there is room.
+    """
     width, height = size
-    legend = Image.new("RGB", size, _BACKGROUND)
-    draw = ImageDraw.Draw(legend)
+    picture = Image.new("RGB", size, _BACKGROUND)
+    draw = ImageDraw.Draw(picture)
     margin = 12
     bar = colors()[::-1][np.linspace(0, 255, height - 2 * margin).astype(int)]
-    legend.paste(Image.fromarray(np.repeat(bar[:, None], 22, axis=1)), (2, margin))
+    picture.paste(Image.fromarray(np.repeat(bar[:, None], 22, axis=1)), (2, margin))
     for fraction in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
         y = margin + (1 - fraction) * (height - 2 * margin - 1)
-        label = f"{fraction * ERROR_SCALE:.2f}" + (" and more" if fraction == 1 else "")
+        label = _number(fraction * top, top) + (" and more" if fraction == 1 else "")
         draw.line([(24, y), (29, y)], _FAINT)
         draw.text((34, y), label, _FAINT, font(14), anchor="lm")
-    lines = ("absolute difference", "of display values,", "mean of R, G, B")
     if width >= 240:
         for number, text in enumerate(lines):
-            y = height / 2 + (number - 1) * 20
+            y = height / 2 + (number - 0.5 * (len(lines) - 1)) * 20
             draw.text((width - 8, y), text, _FAINT, font(14), anchor="rm")
-    return legend
+    return picture
+
+
+def _number(value: float, top: float) -> str:
+    return f"{value:.2f}" if 0.1 <= top < 100 else f"{value:.2g}"

@@ -5,7 +5,7 @@ is not installed (optional extra `fast`) or cannot work. Here a tile of pixels s
 steps: distances, box sums, exponential, sums of products, factorisation, prediction. Strips of rows run on as
 many threads as PyTorch may use; each adds into images of its own, which are joined in order.
 
-Weights below 1e-13 are taken as 0: beside a pixel's own weight of 1 they change no digit of float32.
+Weights below 3e-20 are taken as 0; `weights.py` says why.
 
 How the loops are written. The innermost runs over the columns of a tile; its length is not a constant, since
 the compiler would unroll it before it could use vector instructions, and indices that start inside an image
@@ -13,6 +13,10 @@ are unsigned, since signed ones are tested for being negative, element by elemen
 sliced: making a view costs as much as a short row. Compiled code is kept on disk by Numba.
 """
 
-from models.ops.fused.filtering import filter_images as filter_images
-from models.ops.fused.regression import regress as regress
-from models.ops.fused.strips import Kernel as Kernel
+from models.ops.fused.cache import kept_apart
+
+with kept_apart():
+    from models.ops.fused.filtering import FeatureMaps as FeatureMaps
+    from models.ops.fused.filtering import filter_images as filter_images
+    from models.ops.fused.regression import regress as regress
+    from models.ops.fused.strips import Kernel as Kernel

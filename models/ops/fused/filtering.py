@@ -3,75 +3,98 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from models.ops.fused.strips import OPTIONS, TILE, Array, Kernel, Rows, in_threads, padded
-from models.ops.fused.weights import scratch_of, tile_weights
+from models.ops.fused.strips import INNER, OPTIONS, Array, Kernel, Rows, in_threads, padded, tiles
+from models.ops.fused.weights import exponential, scratch_of, tile_weights
+
+TILE = (32, 256)
+"""Rows and columns: so large that patch margins take a fifth of the time."""
 
 
-@njit(**OPTIONS)
-def _gather(images, place, weights, total, norm):
-    """Add the weights of a tile to norm, and the weighted neighbours to total."""
-    t, y, x = place
-    _, channels, rows, columns = weights.shape
-    left = np.uintp(x)
-    for c in range(channels):
-        for i in range(rows):
+@dataclass(frozen=True)
+class FeatureMaps:
+    """Features that weights also look at, see `models.ops.joint`.
+
+    Attributes:
+        maps: Images, their variances, and t, (3, K, H, W).
+        starts: First channel of every feature, and K.
+        numbers: k^2, epsilon, and 1 where weights are multiplied, 0 where the smallest counts.
+    """
+
+    maps: Array
+    starts: NDArray[np.int64]
+    numbers: Array
+
+
+_NONE = FeatureMaps(np.zeros((3, 0, 1, 1), np.float32), np.zeros(1, np.int64), np.zeros(3, np.float32))
+
+
+@njit(**INNER)
+def _join(features, place, scratch, weights, i):
+    """Combine a row of weights with those of the features; place: rows and columns of both pixels."""
+    maps, starts, numbers = features
+    each, joined = scratch[0], scratch[2]
+    y, z, x, w = place
+    product, columns = numbers[2], np.uintp(weights.shape[3])
+    for j in range(columns):
+        joined[j] = np.float32(0.0)
+    for n in range(starts.shape[0] - 1):
+        for j in range(columns):
+            each[j] = np.float32(0.0)
+        for c in range(starts[n], starts[n + 1]):
             for j in range(columns):
-                norm[c, i, j] += weights[0, c, i, j]
-    for g in range(images.shape[1]):
-        for c in range(images.shape[2]):
-            own = c if channels > 1 else 0
-            for i in range(rows):
-                for j in range(np.uintp(columns)):
-                    total[g, c, i, j] += weights[0, own, i, j] * images[t, g, c, y + i, left + j]
+                f = maps[0, c, y, x + j] - maps[0, c, z, w + j]
+                v, r = maps[1, c, y, x + j], maps[1, c, z, w + j]
+                spread = maps[2, c, y, x + j] + maps[2, c, z, w + j]
+                each[j] += (f * f - (v + min(v, r))) / (numbers[1] + numbers[0] * spread)
+        share = np.float32(1.0) / np.float32(starts[n + 1] - starts[n])
+        for j in range(columns):
+            d = max(np.float32(0.0), each[j] * share)
+            # The largest, or the sum: that is the larger and the smaller.
+            joined[j] = max(joined[j], d) + product * min(joined[j], d)
+    for j in range(columns):
+        own, other = weights[0, 0, i, j], exponential(joined[j])
+        weights[0, 0, i, j] = product * own * other + (np.float32(1.0) - product) * min(own, other)
 
 
 @njit(**OPTIONS)
-def _filter_tile(images, source, place, rule, scratch, sums):
+def _filter_tile(images, source, features, place, rule, scratch, sums):
     """Sum a tile's weighted neighbours and weights; place: the frame, the tile's first row and column."""
     total, norm, weights = sums
     centre, top, left = place
-    window, pad = rule[2], rule[2] + rule[3]
-    total.fill(np.float32(0.0))
-    norm.fill(np.float32(0.0))
+    channels, columns = norm.shape[0], np.uintp(norm.shape[2])
+    window, pad, joint = rule[2], rule[2] + rule[3], features[1].shape[0] > 1
     for t in range(images.shape[0]):
-        for down in range(-window, window + 1):
-            for right in range(-window, window + 1):
-                tile_weights(source, (centre, t, top, left, down, right), rule, scratch, weights, 0)
-                _gather(images, (t, top + pad + down, left + pad + right), weights, total, norm)
+        for index in range((2 * window + 1) * (2 * window + 1)):
+            down, right = index // (2 * window + 1) - window, index % (2 * window + 1) - window
+            tile_weights(source, (centre, t, top, left, down, right), rule, scratch, weights, 0)
+            y, x = top + pad + down, np.uintp(left + pad + right)
+            for i in range(norm.shape[1]):
+                if joint:
+                    _join(features, (top + pad + i, y + i, np.uintp(left + pad), x), scratch, weights, i)
+                for c in range(channels):
+                    for j in range(columns):
+                        norm[c, i, j] += weights[0, c, i, j]
+                for g in range(images.shape[1]):
+                    for c in range(images.shape[2]):
+                        own = min(c, channels - 1)
+                        for j in range(columns):
+                            total[g, c, i, j] += weights[0, own, i, j] * images[t, g, c, y + i, x + j]
 
 
-@njit(**OPTIONS)
-def _write(sums, out, y, x):
-    """Write the quotients of a tile to out (G, C, rows, W) at a place, as far as it reaches."""
-    total, norm, _ = sums
-    for g in range(total.shape[0]):
-        for c in range(total.shape[1]):
-            own = c if norm.shape[0] > 1 else 0
-            for i in range(min(total.shape[2], out.shape[2] - y)):
-                for j in range(min(total.shape[3], out.shape[3] - x)):
-                    out[g, c, y + i, x + j] = total[g, c, i, j] / norm[own, i, j]
-
-
-@njit(**OPTIONS)
-def _filter_rows(images, source, task, rule, tile, out):
-    """Filter a strip; task: the frame, the first row and the last but one; out: (G, C, rows, W)."""
-    centre, start, stop = task
-    rows, columns = tile
-    channels = source[0].shape[1]
-    own = channels if rule[4] == 0 else 1
-    total = np.zeros((images.shape[1], images.shape[2], rows, columns), np.float32)
-    sums = (total, np.zeros((own, rows, columns), np.float32), np.zeros((1, own, rows, columns), np.float32))
-    scratch = scratch_of(channels, rule[3], tile)
-    for top in range(start, stop, rows):
-        for left in range(0, out.shape[3], columns):
-            _filter_tile(images, source, (centre, top, left), rule, scratch, sums)
-            _write(sums, out, top - start, left)
-
-
-def filter_images(images: Array, guide: Array, variance: Array, kernel: Kernel, centre: int = 0) -> Array:
+def filter_images(
+    images: Array,
+    guide: Array,
+    variance: Array,
+    kernel: Kernel,
+    centre: int = 0,
+    features: FeatureMaps = _NONE,
+) -> Array:
     """Filter images with the weights that a guide gives; see `models.ops.nlm.nlm_filter`.
 
     Args:
@@ -80,6 +103,7 @@ def filter_images(images: Array, guide: Array, variance: Array, kernel: Kernel, 
         variance: Of the guide, scaled.
         kernel: How patches are compared.
         centre: Which frame is filtered.
+        features: What weights also look at, for kernels with one weight for all channels and one frame.
 
     Returns:
         (G, C, H, W).
@@ -88,12 +112,17 @@ def filter_images(images: Array, guide: Array, variance: Array, kernel: Kernel, 
     out = np.empty((*images.shape[1:3], height, width), np.float32)
     images, source = padded(images, kernel), (padded(guide, kernel), padded(variance, kernel))
     rule = kernel.rule((height, width))
+    joined = (padded(features.maps, kernel), features.starts, features.numbers)
+    own = guide.shape[1] if kernel.channels == "own" else 1
 
-    def run(rows: Rows) -> Array:
-        part = np.empty((*out.shape[:2], rows[1] - rows[0], width), np.float32)
-        _filter_rows(images, source, (centre, *rows), rule, TILE, part)
-        return part
+    def run(rows: Rows) -> None:
+        for top, left, tile in tiles(rows, width, TILE):
+            total, norm = np.zeros((*out.shape[:2], *tile), np.float32), np.zeros((own, *tile), np.float32)
+            sums = (total, norm, np.zeros((1, *norm.shape), np.float32))
+            scratch = scratch_of(kernel.patch, tile)
+            _filter_tile(images, source, joined, (centre, top, left), rule, scratch, sums)
+            out[..., top : top + tile[0], left : left + tile[1]] = total / norm
 
-    for (start, stop), part in in_threads(run, height, kernel.threads):
-        out[:, :, start:stop] = part
+    for _ in in_threads(run, height, kernel.threads):
+        pass
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.ops.nlm import PatchKernel
+from models.pace import tick
 
 Array = NDArray[np.float32]
 Rows = tuple[int, int]
@@ -26,6 +27,9 @@ OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
 }
 """For every kernel. Sums keep their order; NaN keeps its meaning."""
+
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""For kernels that only kernels call."""
 
 MODES = {"own": 0, "least": 1, "mean": 2}
 """Numbers of `PatchKernel.channels`."""
@@ -62,13 +66,27 @@ def padded(image: Array, kernel: Kernel) -> Array:
     return np.pad(np.asarray(image, np.float32), [(0, 0)] * (image.ndim - 2) + far)
 
 
+def tiles(rows: Rows, width: int, size: tuple[int, int]) -> Iterator[tuple[int, int, tuple[int, int]]]:
+    """Yield the first row and column and the size of tiles that cover rows start … stop - 1."""
+    start, stop = rows
+    for top in range(start, stop, size[0]):
+        for left in range(0, width, size[1]):
+            yield top, left, (min(size[0], stop - top), min(size[1], width - left))
+
+
 def in_threads(run: Callable[[Rows], Any], height: int, threads: int) -> Iterator[tuple[Rows, Any]]:
     """Call `run` for strips of whole tiles and yield rows and result in order."""
     tiles = -(-height // TILE[0])
     pieces = min(tiles, 4 * threads) if threads > 1 else 1
     rows = list(pairwise([tiles * i // pieces * TILE[0] for i in range(pieces)] + [height]))
     if threads == 1:
-        yield from ((r, run(r)) for r in rows)
+        yield from _ticking(((r, run(r)) for r in rows), height)
         return
     with ThreadPoolExecutor(threads) as pool:
-        yield from zip(rows, pool.map(run, rows), strict=True)
+        yield from _ticking(zip(rows, pool.map(run, rows), strict=True), height)
+
+
+def _ticking(strips: Iterable[tuple[Rows, Any]], height: int) -> Iterator[tuple[Rows, Any]]:
+    for (start, stop), result in strips:
+        tick((stop - start) / height)
+        yield (start, stop), result

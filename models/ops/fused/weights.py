@@ -2,6 +2,9 @@
 
 Throughout, `source` is the guide and its scaled variance, (T, C, …) padded; `rule` is `Kernel.rule`; `where`
 is the frame of the pixels and that of the neighbours, the tile's first row and column, and the offset.
+
+Every function is compiled by itself and once more inside each caller, so that nesting is kept shallow; and
+loops do not branch on what stays the same in them, since the compiler would copy all loops around.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg"
@@ -14,11 +17,14 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from models.ops.fused.strips import MODES, OPTIONS
+from models.ops.fused.strips import INNER, MODES, OPTIONS, Array
+from models.ops.nlm import CENTRE_FLOOR
 
 _LEAST, _MEAN = MODES["least"], MODES["mean"]
-_CUT = 29.9
-"""exp(-29.9) is 1e-13."""
+_CUT = 45.0
+"""Smaller weights than exp(-45) = 3e-20 are taken as 0. A window may have so few similar pixels that far less
+similar ones decide how a feature enters its fit; a solver in float32 sees those down to about 1e-17, the
+square of its precision over the window's size."""
 
 
 @intrinsic
@@ -35,7 +41,7 @@ def _power_of_two(typing_context: Any, shifted: Any) -> Any:
 
 
 @njit(**OPTIONS, inline="always")
-def _exponential(x):
+def exponential(x):
     """Return exp(-x) for x >= 0 to 2e-7, 0 from `_CUT` on; compiles to vector instructions.
 
     exp(-x) = 2**(n + f) with n whole and |f| <= 1/2; 2**f is its Taylor series.
@@ -53,136 +59,89 @@ def _exponential(x):
     return series * _power_of_two(shifted) if x < np.float32(_CUT) else np.float32(0.0)
 
 
-@njit(**OPTIONS)
-def _tile_distances(source, channel, where, rule, d):
-    """Write d of one channel for a tile and its patch margin, 0 where pixel or neighbour lies outside."""
+@njit(**INNER)
+def patch_rows(source, channels, where, rule, scratch):
+    """Write d, added over channels and summed across patches, for a tile and its patch margin into h.
+
+    channels: the first and the last but one; where a pixel or its neighbour lies outside, d is 0.
+    """
     guide, variance = source
+    row, h, _, _, _ = scratch
     own, other, top, left, down, right = where
     height, width, window, patch, _, numbers = rule
-    squared_k, epsilon, cap = numbers[0], numbers[1], numbers[2]
-    columns = d.shape[1]
-    top, left = top - patch, left - patch
-    first, last = max(0, -down), min(height, height - down)
-    low = min(columns, max(0, max(0, -right) - left))
-    high = min(columns, max(0, min(width, width - right) - left))
-    x, w = np.uintp(left + window + patch), np.uintp(left + window + patch + right)
-    for i in range(d.shape[0]):
-        inside = first <= top + i < last
-        if inside:
-            y = top + i + window + patch
-            z = y + down
-            for j in range(np.uintp(columns)):
-                u = guide[own, channel, y, x + j] - guide[other, channel, z, w + j]
-                v, r = variance[own, channel, y, x + j], variance[other, channel, z, w + j]
-                value = (u * u - (v + min(v, r))) / (squared_k * (v + r) + epsilon)
-                d[i, j] = value if value < cap else cap  # NaN becomes the cap
-        for j in range(low if inside else columns):
-            d[i, j] = np.float32(0.0)
-        for j in range(high, columns):
-            d[i, j] = np.float32(0.0)
-
-
-@njit(**OPTIONS)
-def _across(d, h, patch):
-    """Sum 2 patch + 1 neighbours of every row."""
-    columns = h.shape[1]
+    wide, columns, pad = np.uintp(row.shape[0]), np.uintp(h.shape[1]), window + patch
+    low = max(0, max(0, -right) - (left - patch))
+    high = max(0, min(width, width - right) - (left - patch))
+    x, w = np.uintp(left + window), np.uintp(left + window + right)
     for i in range(h.shape[0]):
-        if patch == 3:
+        y = top - patch + i
+        for j in range(wide):
+            row[j] = np.float32(0.0)
+        if max(0, -down) <= y < min(height, height - down):
+            for c in range(channels[0], channels[1]):
+                for j in range(wide):
+                    u = guide[own, c, y + pad, x + j] - guide[other, c, y + pad + down, w + j]
+                    v, r = variance[own, c, y + pad, x + j], variance[other, c, y + pad + down, w + j]
+                    value = (u * u - (v + min(v, r))) / (numbers[0] * (v + r) + numbers[1])
+                    row[j] += value if value < numbers[2] else numbers[2]  # NaN becomes the cap
+            for j in range(min(low, row.shape[0])):
+                row[j] = np.float32(0.0)
+            for j in range(np.uintp(high), wide):
+                row[j] = np.float32(0.0)
+        for j in range(columns):
+            h[i, j] = row[j]
+        for n in range(np.uintp(1), np.uintp(2 * patch + 1), np.uintp(2)):
+            after = n + np.uintp(1)
             for j in range(columns):
-                first = (d[i, j] + d[i, j + 1]) + (d[i, j + 2] + d[i, j + 3])
-                h[i, j] = first + ((d[i, j + 4] + d[i, j + 5]) + d[i, j + 6])
-        elif patch == 1:
-            for j in range(columns):
-                h[i, j] = d[i, j] + d[i, j + 1] + d[i, j + 2]
-        else:
-            for j in range(columns):
-                h[i, j] = d[i, j]
-            for n in range(1, 2 * patch + 1):
-                for j in range(columns):
-                    h[i, j] += d[i, j + n]
+                h[i, j] += row[j + n] + row[j + after]
 
 
-@njit(**OPTIONS)
-def _down(h, out, channel, patch):
-    """Sum 2 patch + 1 rows."""
-    _, rows, columns = out.shape
-    for i in range(rows):
-        if patch == 3:
-            for j in range(columns):
-                first = (h[i, j] + h[i + 1, j]) + (h[i + 2, j] + h[i + 3, j])
-                out[channel, i, j] = first + ((h[i + 4, j] + h[i + 5, j]) + h[i + 6, j])
-        elif patch == 1:
-            for j in range(columns):
-                out[channel, i, j] = h[i, j] + h[i + 1, j] + h[i + 2, j]
-        else:
-            for j in range(columns):
-                out[channel, i, j] = h[i, j]
-            for n in range(1, 2 * patch + 1):
-                for j in range(columns):
-                    out[channel, i, j] += h[i + n, j]
-
-
-@njit(**OPTIONS)
-def _shares(start, step, size, patch, shares):
+@njit(**INNER)
+def shares(start, step, size, patch, values):
     """Write 1 / (patch positions that exist) along one axis, 0 where pixel or neighbour lies outside."""
     first, last = max(0, -step), min(size, size - step)
-    for i in range(shares.shape[0]):
+    for i in range(values.shape[0]):
         place = start + i
         number = min(place + patch, last - 1) - max(place - patch, first) + 1
-        shares[i] = np.float32(1.0) / np.float32(number) if first <= place < last else np.float32(0.0)
+        values[i] = np.float32(1.0) / np.float32(number) if first <= place < last else np.float32(0.0)
 
 
-@njit(**OPTIONS)
-def _combine(sums, mode):
-    """Reduce the channels' patch sums to one, in the first."""
-    channels, rows, columns = sums.shape
-    for c in range(1, channels):
-        for i in range(rows):
-            if mode == _LEAST:
-                for j in range(columns):
-                    sums[0, i, j] = max(sums[0, i, j], sums[c, i, j])
-            else:
-                for j in range(columns):
-                    sums[0, i, j] += sums[c, i, j]
-    if mode == _MEAN:
-        for i in range(rows):
-            for j in range(columns):
-                sums[0, i, j] /= np.float32(channels)
-
-
-@njit(**OPTIONS)
+@njit(**INNER)
 def tile_weights(source, where, rule, scratch, out, at):
     """Write the weights of a tile towards one offset into out[at], (channels or 1, rows, columns)."""
-    d, h, sums, rows, columns = scratch
+    _, h, sums, row_shares, column_shares = scratch
     own, other, top, left, down, right = where
     height, width, _, patch, mode, _ = rule
-    _shares(top, down, height, patch, rows)
-    _shares(left, right, width, patch, columns)
-    for c in range(sums.shape[0]):
-        _tile_distances(source, c, where, rule, d)
-        _across(d, h, patch)
-        _down(h, sums, c, patch)
-    if mode in (_LEAST, _MEAN):
-        _combine(sums, mode)
-    centre = own == other and down == 0 and right == 0
-    for c in range(out.shape[1]):
+    channels, columns = source[0].shape[1], np.uintp(out.shape[3])
+    together = channels if mode == _MEAN else 1
+    last = channels - together if mode == _LEAST else 0  # smaller channels only compare their sums
+    shares(top, down, height, patch, row_shares)
+    shares(left, right, width, patch, column_shares)
+    floor = np.float32(CENTRE_FLOOR if own == other and down == 0 and right == 0 else 0.0)
+    for c in range(0, channels, together):
+        patch_rows(source, (c, c + together), where, rule, scratch)
+        target = min(c, out.shape[1] - 1)
+        kept = np.float32(1.0 if target < c else 0.0)  # the largest of all channels' sums
         for i in range(out.shape[2]):
-            row_share = rows[i]
-            for j in range(out.shape[3]):
-                share = row_share * columns[j]
-                weight = _exponential(max(np.float32(0.0), sums[c, i, j] * share))
-                out[at, c, i, j] = weight if share > np.float32(0.0) else np.float32(0.0)
-            if centre:
-                for j in range(out.shape[3]):
-                    if row_share * columns[j] > np.float32(0.0):
-                        out[at, c, i, j] = max(out[at, c, i, j], np.float32(1e-4))
+            for j in range(columns):
+                sums[j] = h[i, j]
+            for n in range(1, 2 * patch + 1, 2):
+                for j in range(columns):
+                    sums[j] += h[i + n, j] + h[i + n + 1, j]
+            for j in range(columns):
+                sums[j] = max(sums[j], out[at, target, i, j] * kept)
+            if c < last:
+                for j in range(columns):
+                    out[at, target, i, j] = sums[j]
+                continue
+            share = row_shares[i] / np.float32(together)
+            for j in range(columns):
+                weight = max(exponential(sums[j] * (column_shares[j] * share)), floor)
+                out[at, target, i, j] = weight if column_shares[j] * share > 0.0 else np.float32(0.0)
 
 
-@njit(**OPTIONS)
-def scratch_of(channels, patch, tile):
-    """Return what `tile_weights` works with: d, sums across, patch sums, shares of rows and columns."""
+def scratch_of(patch: int, tile: tuple[int, int]) -> tuple[Array, ...]:
+    """Return what `tile_weights` works with: d, sums across, a row of sums, shares of rows and columns."""
     rows, columns = tile
-    d = np.zeros((rows + 2 * patch, columns + 2 * patch), np.float32)
-    h = np.zeros((rows + 2 * patch, columns), np.float32)
-    sums = np.zeros((channels, rows, columns), np.float32)
-    return d, h, sums, np.zeros(rows, np.float32), np.zeros(columns, np.float32)
+    sizes = (columns + 2 * patch, (rows + 2 * patch, columns), columns, rows, columns)
+    return tuple(np.zeros(size, np.float32) for size in sizes)

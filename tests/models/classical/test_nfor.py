@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,13 @@ from torch import Tensor
 
 from models.classical.nfor import NFOR, estimated_error
 from models.denoiser import Buffers
+from models.ops.halves import Halves
 from tests.models import plain_nfor
+
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 SIZE = 24
 NAMES = ("normal", "albedo", "depth")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
 
 
 def scene(seed: int = 0) -> dict[str, Tensor]:
@@ -120,7 +112,7 @@ def test_the_error_estimate_is_right_in_the_mean() -> None:
     clean, bias, variance = torch.tensor(2.0), 0.3, torch.tensor(0.5)
     a, b = (clean + torch.randn(400_000) for _ in "ab")  # each half has twice the variance of the mean
     filtered = [clean + bias + 0.2 * torch.randn(400_000) for _ in "ab"]
-    found = estimated_error(a, b, variance, *filtered).mean()
+    found = estimated_error(Halves(a, b, variance), *filtered).mean()
     assert abs(found - (bias**2 + 0.2**2 / 2)) < 0.01
 
 
@@ -128,7 +120,12 @@ def test_pixels_without_variance_do_not_spread(buffers: dict[str, Tensor]) -> No
     holes = single(buffers)
     holes["albedo_variance"] = holes["albedo_variance"].clone()
     holes["albedo_variance"][..., ::5, ::7] = torch.nan
-    assert NFOR()(holes).color.isfinite().all()
+    holes["color_variance"] = holes["color_variance"].clone()
+    holes["color_variance"][..., 3, 20] = torch.nan
+    found = NFOR().details(holes)
+    assert found.color.isfinite().all()
+    assert found.selection is not None
+    assert (found.selection[..., 3, 20] == 1).all()  # as for a tie
 
 
 def test_nothing_beyond_the_halo_matters_and_its_rim_does() -> None:
@@ -190,7 +187,7 @@ def test_exposure_scales_only_the_constant_of_the_distances(buffers: dict[str, T
 def test_wrong_arguments_are_refused(buffers: dict[str, Tensor]) -> None:
     with pytest.raises(ValueError, match="preset must be public or paper, got 'fast'"):
         NFOR("fast")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="frames must be at least 0"):
+    with pytest.raises(ValueError, match="frames and smoothing must be at least 0"):
         NFOR(frames=-1)
     with pytest.raises(ValueError, match="unknown buffer 'gloss'"):
         NFOR(features=("gloss",))

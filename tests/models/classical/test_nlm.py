@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -16,15 +15,7 @@ from models.ops.pyramid import coarser, coarser_variance, finer
 from tests.models import plain_nlm
 from tests.models.frames import largest_relative, split_buffers
 
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with torch.no_grad():
-        yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 
 def as_rows(image: Tensor) -> plain_nlm.Array:

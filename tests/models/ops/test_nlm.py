@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,7 @@ from models.ops.nlm import Guide, PatchKernel, nlm_filter, strips
 from tests.models import plain_nlm
 from tests.models.frames import largest_relative
 
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def random_guide(
@@ -96,9 +88,15 @@ def test_strips_equal_the_whole() -> None:
 def test_strips_cover_every_row_once_and_have_at_least_8_rows() -> None:
     for height in (1, 8, 17, 100):
         for budget in (1.0, 90.0, 1e9):
-            cuts = strips(height, 10.0, budget)
+            cuts = strips(height, 10.0, budget, torch.device("cpu"))
             assert [r for start, stop in cuts for r in range(start, stop)] == list(range(height))
             assert len(cuts) == 1 or min(stop - start for start, stop in cuts) >= 4
+
+
+def test_without_a_budget_strips_fit_the_cache_on_a_cpu_and_are_large_elsewhere() -> None:
+    cpu, other = (strips(1000, 1e6, None, torch.device(name)) for name in ("cpu", "meta"))
+    assert max(stop - start for start, stop in cpu) <= 64
+    assert other == [(0, 1000)]
 
 
 @pytest.mark.parametrize("threads", [1, 2])

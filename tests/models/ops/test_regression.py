@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -14,16 +12,9 @@ from models.ops.regression import Sample, collaborative_regression
 from tests.models import plain_nfor
 from tests.models.frames import largest_relative
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 KERNEL = PatchKernel(3, 1, (0.7,), scale=2.0, channels="least")
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images are tiny here: a second thread only waits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def sample(height: int = 16, width: int = 18, features: int = 3, seed: int = 0) -> Sample:
@@ -71,6 +62,19 @@ def test_what_is_linear_in_position_and_features_is_reproduced(fused: bool) -> N
 
 
 @pytest.mark.parametrize("fused", [False, True])
+def test_features_that_hardly_differ_are_told_apart_in_windows_of_361_similar_pixels(fused: bool) -> None:
+    one = sample(24, 32, features=2)
+    nearly = one.features[:, :1] + 3e-3 * one.features[:, 1:]
+    features = torch.cat([one.features[:, :1], nearly], 1)
+    guide = Guide(one.guide[0], torch.full_like(one.guide[1], 0.3))
+    kernel = PatchKernel(9, 3, scale=2.0, channels="least")
+    found = fitted([Sample(one.image, features, guide)], kernel, fused)
+    exact = Sample(one.image.double(), features.double(), Guide(guide[0].double(), guide[1].double()))
+    # Sums of float32 numbers, added one by one, would be wrong by more than 2e-4.
+    assert (found - fitted([exact], kernel)).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("fused", [False, True])
 def test_constant_repeated_and_rescaled_features_change_nothing(fused: bool) -> None:
     one = sample(features=2)
     expected = fitted([one], fused=fused)
@@ -88,7 +92,7 @@ def test_strips_equal_the_whole() -> None:
     assert largest_relative(found, expected) < 1e-5
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [1, 2, 3])
 def test_fused_fits_equal_pytorch_on_images_of_many_tiles(threads: int) -> None:
     one = sample(35, 150, features=7)
     kernel = PatchKernel(4, 3, (0.5, 1.0), scale=2.0, channels="least")

@@ -1,0 +1,24 @@
+"""Fixtures of the tests of networks and filters; a module asks for them with `pytestmark`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Compute in one thread, as suits tiny images: a second one only waits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def no_gradients() -> Iterator[None]:
+    """Compute as inference does, without a graph."""
+    with torch.no_grad():
+        yield
