@@ -98,7 +98,7 @@ def _with_aux(loaded: Loaded) -> Loaded:
     """Let a model of a file return what it makes on its way."""
     if not isinstance(getattr(loaded.model, "aux", None), bool):
         raise UsageError(
-            f"--aux, --layers: {loaded.source.reference} gives an image and nothing else; checkpoints of "
+            f"--aux: {loaded.source.reference} gives an image and nothing else; checkpoints of "
             "Layer and Optimized give their layers, NFOR its errors and features"
         )
     loaded.model.aux = True  # type: ignore[union-attr]  # checked above
@@ -231,7 +231,7 @@ def _from_class_name(name: str, device: str, options: Sequence[str], aux: bool) 
     cls = find_class(class_path)
     arguments = parse(cls, options)
     if aux and "aux" not in options_of(cls):
-        raise UsageError(f"--aux, --layers: {name} makes nothing on its way that could be shown; NFOR does")
+        raise UsageError(f"--aux: {name} makes nothing on its way that could be shown; NFOR does")
     denoiser = build(class_path, {**arguments, **({"aux": True} if aux else {})})
     if next(denoiser.parameters(), None) is not None:
         raise ValueError(

@@ -53,8 +53,8 @@ def dropped(samples: Tensor) -> str | None:
     return f"{text}; {empty} pixels had no other and were filled from around them" if empty else text
 
 
-def require_layers(loaded: Loaded) -> None:
-    """Check that a model has layers to show.
+def return_layers(loaded: Loaded) -> None:
+    """Let a model return its layers as `Denoised.aux`.
 
     Raises:
         UsageError: It has none.
@@ -63,6 +63,7 @@ def require_layers(loaded: Loaded) -> None:
         raise UsageError(
             f"--layers shows the layers of Layer and Optimized; {loaded.source.reference} is another method"
         )
+    loaded.model.aux = True
 
 
 def layer_pictures(result: Result) -> dict[str, Image]:

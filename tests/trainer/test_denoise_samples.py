@@ -13,15 +13,18 @@ from PIL import Image
 
 import trainer.loading
 from data.exr import read_frame
+from data.exr_image import read_exr
 from data.frame import Frame, Samples
 from data.root import resolve_root
 from models import Layer, PixelGather
 from models.denoiser import select
 from models.ops.per_sample import sample_counts
+from models.tiling import denoise_in_tiles
 from trainer.commands import denoise as command
+from trainer.configs import UsageError
 from trainer.export.description import Source
 from trainer.loading import Loaded
-from trainer.samples import dropped, layers_of, sample_tensor
+from trainer.samples import dropped, sample_tensor
 
 SMALL: dict[str, Any] = {"width": 4, "levels": 2, "kernel_size": 3, "embedding": 6}
 FRAME = resolve_root("sample:layers").path / "indoor-000104" / "f000.exr"
@@ -29,7 +32,11 @@ FRAME = resolve_root("sample:layers").path / "indoor-000104" / "f000.exr"
 
 def small(kind: type = Layer, **arguments: Any) -> Any:
     torch.manual_seed(3)
-    return kind(**{**SMALL, **arguments}).eval()
+    aux = arguments.pop("aux", False)
+    model = kind(**{**SMALL, **arguments}).eval()
+    if aux:
+        model.aux = True
+    return model
 
 
 def denoise(monkeypatch: pytest.MonkeyPatch, model: Any, output: Path, *options: str) -> int:
@@ -63,9 +70,13 @@ def test_layers_are_written_as_pictures_of_before_after_and_opacity(
     denoise(monkeypatch, small(layers=3), tmp_path, "--layers")
     names = {path.name for path in (tmp_path / "f000_layers").iterdir()}
     parts = ("unfiltered", "filtered", "alpha")
-    assert names == {"composite.png", *(f"layer{n}-{part}.png" for n in range(3) for part in parts)}
-    with Image.open(tmp_path / "f000_layers" / "layer1-alpha.png") as alpha:
-        assert (alpha.size, alpha.mode) == ((64, 64), "L")
+    assert names == {
+        "composite.png",
+        "layers.png",
+        *(f"layer{n}_{part}.png" for n in range(3) for part in parts),
+    }
+    with Image.open(tmp_path / "f000_layers" / "layer1_alpha.png") as alpha:
+        assert alpha.size == (64, 64)
     with pytest.raises(ValueError, match="f000"):  # what is there is not overwritten
         denoise(monkeypatch, small(layers=3), tmp_path, "--layers")
 
@@ -73,20 +84,37 @@ def test_layers_are_written_as_pictures_of_before_after_and_opacity(
 def test_layers_of_a_model_without_any_are_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ValueError, match=r"--layers needs a model with layers .* small has none"):
+    with pytest.raises(UsageError, match=r"--layers shows the layers of .* small is another method"):
         denoise(monkeypatch, small(PixelGather), tmp_path, "--layers")
 
 
+def test_layers_are_an_exr_too_and_their_front_to_back_composite_is_the_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    denoise(monkeypatch, small(layers=3, aux=True), tmp_path, "--aux")
+    held = read_exr(tmp_path / "f000_aux.exr").channels
+    image, light = np.zeros((64, 64)), np.ones((64, 64))
+    for layer in range(3):
+        image += light * held[f"layer{layer}_filtered.G"]
+        light *= 1 - held[f"layer{layer}_alpha.Y"]
+    np.testing.assert_allclose(image, held["G"], rtol=2e-3, atol=1e-4)
+    sums = sum(held[f"layer{layer}_unfiltered.G"] for layer in range(3))
+    frame = read_frame(FRAME)
+    assert frame.samples is not None
+    mean = frame.samples.values[..., frame.samples.channels.index("radiance.G")].mean(0)
+    np.testing.assert_allclose(sums, mean, rtol=2e-3, atol=1e-4)
+
+
 def test_layers_in_tiles_are_those_of_the_whole_frame() -> None:
-    model = small()
+    model = small(aux=True)
     buffers = {"samples": sample_tensor(read_frame(FRAME), model)[..., :50, :]}
-    whole = layers_of(model, buffers, 10**9)
-    needed = (16 + 2 * model.halo) * 64 * model.bytes_per_pixel
-    tiled = layers_of(model, buffers, needed)
-    for name in ("unfiltered", "filtered", "alpha", "composite"):
-        one, other = getattr(tiled, name), getattr(whole, name)
-        assert one.shape[1 if name != "composite" else 0] == 50
-        np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())
+    with torch.no_grad():
+        whole = model(buffers).aux
+        tiled = denoise_in_tiles(model, buffers, tile=16).aux
+    assert tiled.keys() == whole.keys()
+    for name, layer in whole.items():
+        assert layer.shape[-2:] == (50, 64)
+        torch.testing.assert_close(tiled[name], layer, rtol=0, atol=1e-5 * layer.abs().max().item())
 
 
 def test_a_frame_without_samples_is_refused_with_what_was_expected() -> None:

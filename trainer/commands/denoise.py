@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     from trainer.outputs import make_folder, refuse_existing
     from trainer.progress import FrameProgress
     from trainer.results import Wanted, write
-    from trainer.samples import require_layers
+    from trainer.samples import return_layers
     from trainer.sequences import denoiser_of
 
     _check_device(args.device)
@@ -123,13 +123,13 @@ def run(args: argparse.Namespace) -> int:
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
     make_folder(args.output)
-    loaded = resolve(args.model, args.device, options=args.option, aux=args.aux or args.layers)
+    loaded = resolve(args.model, args.device, options=args.option, aux=args.aux)
     number = args.exposure if isinstance(args.exposure, float) else None
     settings = Settings(
         number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device, args.attention
     )
     if args.layers:
-        require_layers(loaded)
+        return_layers(loaded)
     kernels = Kernels(loaded.model, args.device)
     with FrameProgress(len(items), kernels.hint) as progress, kernels.announced(progress.say):
         for clip in clips:

@@ -34,7 +34,8 @@ class Artifact:
 
     Attributes:
         description: The metadata of the file.
-        inputs, frame_numbers, halo, multiple, temporal, per_sample, samples, fill: As declared by the denoiser.
+        inputs, frame_numbers, halo, multiple, temporal, per_sample, samples, fill: As declared by the
+            denoiser.
         frames, frame_halo: 0: exported files take images.
     """
 
