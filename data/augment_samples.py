@@ -4,6 +4,9 @@ What lies in the image plane turns with the image: motion (x to the right, y dow
 to the left, y up, as Mitsuba's cameras have it), positions within the pixel. Normals turn as vectors of the
 view do (x to the right, y up). For normals and positions in world space that is exact as well: the changed
 frame shows the mirrored scene in a world whose axes lie otherwise, which means nothing to a denoiser.
+
+The authors of the layer method, whose normals are in view space (as the layouts `layerdenoise` and `sbmc` say
+of theirs), turn normals alone; motion and lens stay as they are in their code.
 """
 
 from __future__ import annotations

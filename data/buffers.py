@@ -231,9 +231,14 @@ _SINGLE = ("reference", "reference_diffuse", "history", "hit")
 BUFFERS: dict[str, Buffer] = {b.name: b for b in _PLAIN}
 BUFFERS |= {d.name: d for b in _PLAIN if b.name not in _SINGLE for d in _derived(b)}
 
-FRAME_NUMBERS: dict[str, int] = {"exposure": 1, "depth_range": 2}
+THIN_LENS = "thin_lens"
+"""Frame number that describes the camera's lens."""
+
+FRAME_NUMBERS: dict[str, int] = {"exposure": 1, "depth_range": 2, THIN_LENS: 3}
 """Numbers of a whole frame and how many each has: the factor that brings radiance to a displayable level
-(1 where absent) and the smallest and largest depth of the whole frame, which a crop cannot know."""
+(1 where absent), the smallest and largest depth of the whole frame, which a crop cannot know, and the
+camera's aperture radius, focus distance (both in the unit of depth, 0 for a pinhole) and field of view in
+degrees (all 0 where unknown)."""
 
 
 @dataclass(frozen=True)

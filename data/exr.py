@@ -18,14 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import BUFFERS, buffer
+from data.buffers import BUFFERS, SAMPLES, THIN_LENS, buffer
 from data.camera import Camera
+from data.dropped import mean
 from data.exr_image import HALF_FLOOR as HALF_FLOOR
 from data.exr_image import HALF_MAX as HALF_MAX
 from data.exr_image import ExrImage as ExrImage
 from data.exr_image import read_exr as read_exr
 from data.exr_image import write_exr as write_exr
-from data.exr_samples import is_sample, read_samples, write_samples
+from data.exr_samples import KNOWN_SAMPLES, ReadSamples, is_sample, read_samples, write_samples
 from data.frame import Frame, Image
 from data.repair import all_finite, repair
 
@@ -33,7 +34,8 @@ KNOWN_NAMINGS = (
     "<buffer>.R/.G/.B, .X/.Y/.Z or .Z with the buffers color, irradiance, albedo, diffuse_albedo, "
     "specular_albedo, normal, depth, position, motion, reference …; the same with A, B or Variance after the "
     "buffer (colorA.R, colorVariance.R); plain R, G, B in a file named after its buffer "
-    "(color0.exr, albedo0.exr, shading_normal0.exr, world_position0.exr, reference0.exr)"
+    "(color0.exr, albedo0.exr, shading_normal0.exr, world_position0.exr, reference0.exr); "
+    f"{KNOWN_SAMPLES}"
 )
 
 _MARK = "penumbra"
@@ -118,7 +120,7 @@ def _read(path: Path, only: str | None, choose: Choose | None, with_samples: boo
     image = read_exr(path, keep_half=True)
     own = _MARK in image.attributes
     groups, ignored = _groups(image, only, any(map(is_sample, image.channels)))
-    samples, invalid = read_samples(image, own) if with_samples or not groups else (None, 0)
+    kept = read_samples(image, own) if with_samples or not groups else ReadSamples()
     halves: dict[str, Halves] = {}
     if choose is not None and groups and own:
         groups, halves = _chosen(image, groups, choose)
@@ -127,17 +129,19 @@ def _read(path: Path, only: str | None, choose: Choose | None, with_samples: boo
         buffers[name], hidden = _converted(image, name, channels, planar=choose is not None)
         if hidden:
             outside[name] = hidden
+    if kept.samples is not None and not buffers:
+        buffers["color"] = mean(kept.samples.get("radiance"))
     buffers, repaired = repair(buffers)
-    if invalid:
-        repaired["samples"] = invalid
-    if samples is not None and not buffers:
-        buffers["color"] = samples.get("radiance").mean(0)
-    frame = replace(_described(path, image, buffers), samples=samples)
+    if kept.replaced:
+        repaired[SAMPLES] = kept.replaced
+    ignored = sorted((*ignored, *kept.ignored))
+    frame = replace(_described(path, image, buffers), samples=kept.samples)
     frame.notes["channels"] = groups
     frame.notes["precision"] = {n: _precision(image, channels) for n, channels in groups.items()}
-    for key, value in (("repaired", repaired), ("ignored", ignored), ("outside_data_window", outside)):
-        if value:
-            frame.notes[key] = value
+    told: dict[str, Any] = {"repaired": repaired, "ignored": ignored, "outside_data_window": outside}
+    if kept.dropped is not None:
+        told["dropped"] = list(kept.dropped)
+    frame.notes |= {key: value for key, value in told.items() if value}
     if not own:  # our own files were looked at when they were made
         for name, array in buffers.items():
             _warn_unless_radiance(path, name, array)
@@ -234,6 +238,7 @@ def _attributes(frame: Frame) -> dict[str, Any]:
         f"{_MARK}.accumulated": json.dumps(frame.accumulated),
         **{f"{_MARK}.{k}": repr(v) for k, v in numbers.items() if v is not None},
         **({f"{_MARK}.camera": json.dumps(frame.camera.to_json())} if frame.camera else {}),
+        **({f"{_MARK}.{THIN_LENS}": json.dumps(frame.thin_lens)} if frame.thin_lens else {}),
         **({f"{_MARK}.notes": json.dumps(kept)} if kept else {}),
     }
 
@@ -253,9 +258,17 @@ def _described(path: Path, image: ExrImage, buffers: dict[str, Image]) -> Frame:
             spp=int(header["spp"]) if "spp" in header else None,
             accumulated=bool(json.loads(header.get("accumulated", "false"))),
             notes=dict(json.loads(header.get("notes", "{}"))),
+            thin_lens=_numbers(header.get(THIN_LENS)),
         )
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: cannot understand the file's header or buffers: {error}") from error
+
+
+def _numbers(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    aperture, focus, view = json.loads(text)
+    return float(aperture), float(focus), float(view)
 
 
 def _groups(

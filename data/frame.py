@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +20,8 @@ class Samples:
     """The samples of a frame, kept apart.
 
     Attributes:
-        values: float32 (S, H, W, C), S samples per pixel in no particular order, raw linear values.
+        values: float32 (S, H, W, C), S samples per pixel in no particular order, raw linear values; NaN in
+            every channel of a sample that does not count (`data.dropped`).
         channels: What the C channels are, such as `radiance.R`; see `data.buffers.SAMPLE_BUFFERS`.
     """
 
@@ -83,6 +85,8 @@ class Frame:
         accumulated: `irradiance` is accumulated over the preceding frames.
         notes: What was derived, repaired or assumed, for the manifest and `trainer inspect`.
         samples: The samples of each pixel, where the source keeps them apart.
+        thin_lens: Aperture radius, focus distance and field of view (`data.buffers.FRAME_NUMBERS`), None
+            where unknown.
     """
 
     buffers: dict[str, Image]
@@ -94,6 +98,7 @@ class Frame:
     accumulated: bool = False
     notes: dict[str, Any] = field(default_factory=dict)
     samples: Samples | None = None
+    thin_lens: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         self.validate()
@@ -133,6 +138,9 @@ class Frame:
                 )
             if array.dtype != np.float32:
                 raise ValueError(f"{self.label}: buffer {name!r} is {array.dtype}, expected float32")
+        numbers = self.thin_lens
+        if numbers is not None and not all(math.isfinite(n) and n >= 0 for n in numbers):
+            raise ValueError(f"{self.label}: thin_lens is {numbers}, expected numbers >= 0")
         size = (self.height, self.width)
         if self.samples is not None and self.samples.values.shape[1:3] != size:
             height, width = self.samples.values.shape[1:3]

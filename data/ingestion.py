@@ -35,7 +35,7 @@ from data.parallel import results
 PARTIAL = ".partial"
 """Folder inside the output that remembers finished frames until the manifest is written."""
 
-REMARKS = ("derived", "decoded", "normalised", "clipped", "assumed", "camera")
+REMARKS = ("derived", "decoded", "normalised", "clipped", "assumed", "camera", "dropped")
 """Notes of a frame that are kept in its record."""
 
 Progress = Callable[[int, int, str], None]

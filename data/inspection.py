@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data.buffers import BUFFERS, buffer
+from data.buffers import SAMPLES as KEPT_APART
+from data.dropped import Dropped, total
 from data.exr import read_frame
 from data.frame import Frame, Image
 from data.frames import FrameSet
@@ -82,7 +85,11 @@ def describe_frame(frame: Frame) -> dict[str, Any]:
         },
         "samples": None
         if frame.samples is None
-        else {"count": frame.samples.count, "quantities": list(frame.samples.names)},
+        else {
+            "count": frame.samples.count,
+            "quantities": list(frame.samples.names),
+            "dropped": _dropped([frame.notes.get("dropped")]),
+        },
         "ignored": frame.notes.get("ignored", []),
         "derived": frame.notes.get("derived", {}),
     }
@@ -130,6 +137,7 @@ def _data_set(root: Path) -> dict[str, Any]:
                 "spp": scene.frames[0].spp,
                 "exposure": [min(f.exposure for f in scene.frames), max(f.exposure for f in scene.frames)],
                 "repaired": _sum(f.repaired for f in scene.frames),
+                "dropped": _dropped(f.remarks.get("dropped") for f in scene.frames),
                 "thresholds": scene.thresholds,
                 "credit": scene.credit,
                 "license": scene.license,
@@ -218,10 +226,11 @@ def _sample_statistics(data: bytes) -> dict[str, dict[str, Any]]:
         meta, raw = json.loads(members[".json"]), members[".buffers"]
     except (tarfile.TarError, KeyError) as error:
         raise ValueError(f"a sample is no pair of .json and .buffers ({error})") from error
-    result = {}
+    result: dict[str, dict[str, Any]] = {}
     for entry in meta["buffers"]:
         count = int(np.prod(entry["shape"]))
         array = np.frombuffer(raw, entry["dtype"], count, entry["offset"]).reshape(entry["shape"])
+        result |= _quantities(entry, array) if entry["name"] == KEPT_APART else {}
         if entry["name"] in BUFFERS:
             image = np.moveaxis(array, 0, -1).astype(np.float32)
             good = np.isfinite(image).all(-1)
@@ -232,6 +241,14 @@ def _sample_statistics(data: bytes) -> dict[str, dict[str, Any]]:
                 "non_finite_percent": 100 * float(1 - good.mean()),
             }
     return result
+
+
+def _quantities(entry: Mapping[str, Any], array: NDArray[Any]) -> dict[str, dict[str, Any]]:
+    """Return type, shape and the share of dropped samples of samples that are kept apart."""
+    gone = np.isnan(array).all(1)
+    kind = "half" if array.dtype.itemsize == 2 else "float"
+    percent = 100 * float(gone.mean())
+    return {KEPT_APART: {"type": kind, "shape": list(entry["shape"]), "non_finite_percent": percent}}
 
 
 def _merge(values: list[dict[str, Any]]) -> dict[str, Any]:
@@ -248,6 +265,12 @@ def _merge(values: list[dict[str, Any]]) -> dict[str, Any]:
     for key in ("no_hit_percent", "non_finite_percent"):
         merged[key] = float(np.mean([v.get(key, 0.0) for v in values]))
     return merged
+
+
+def _dropped(notes: Iterable[Sequence[int] | None]) -> dict[str, int]:
+    """Return samples that do not count, pixels that they lie in, and pixels without any other."""
+    found = total(numbers for numbers in notes if numbers)
+    return (found or Dropped(0, 0, 0))._asdict()
 
 
 def _sum(counts: Any) -> dict[str, int]:

@@ -39,7 +39,7 @@ class FrameRecord:
         samples: Quantities that are kept per sample, empty where samples are not kept apart.
         checks: What was measured when the frame was made, such as `energy_z` and `reference_relmse`.
         remarks: What its layout did to stored buffers or took for granted: `derived`, `decoded`,
-            `normalised`, `clipped`, `assumed`, `camera`.
+            `normalised`, `clipped`, `assumed`, `camera`; `dropped`, numbers as in `data.dropped.Dropped`.
     """
 
     index: int

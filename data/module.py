@@ -68,8 +68,10 @@ class Shards(LightningDataModule):
             batch, where frames keep samples apart; None: all.
         spp: Use only frames with these samples per pixel, where the root is prepared here; None: all.
 
-    Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W) and `sample_channels`,
-    a list of C names such as `radiance.R`. They turn with the image (`data.augment_samples`).
+    Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W), `sample_channels`, a
+    list of C names such as `radiance.R`, and `thin_lens` (B, 3), aperture radius, focus distance and field of
+    view, 0 where unknown. Samples turn with the image (`data.augment_samples`). Those that do not count are
+    NaN, so that a pixel may have none, the more of them the fewer `sample_counts` leave.
     """
 
     def __init__(

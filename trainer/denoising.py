@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from data.buffers import SAMPLES
+from data.buffers import SAMPLES, THIN_LENS
 from data.derive import automatic_exposure, derive
+from data.dropped import Dropped
 from data.frame import Frame, Image
 from data.temporal import Accumulator
 from models.denoiser import Denoiser
@@ -27,7 +28,7 @@ from trainer.clips import Clip, Item
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.inputs import Fitting, Say, advice
 from trainer.loading import Loaded, Model
-from trainer.samples import dropped, sample_tensor
+from trainer.samples import dropped, filled, sample_tensor
 
 LARGE, SAMPLE = 20_000, 32
 """Pixels of all frames above which the time of steps is measured first, and on how large a corner."""
@@ -313,9 +314,14 @@ class ClipDenoiser:
         if SAMPLES in model.inputs:
             buffers[SAMPLES] = sample_tensor(frame, model)
             if lost := dropped(buffers[SAMPLES]):
-                self.say(f"{frame.label}: {lost}", "warning")
-        if "exposure" in model.frame_numbers:
-            buffers["exposure"] = torch.tensor([prepared.exposure], dtype=torch.float32)
+                frame.notes["dropped"] = list(lost)
+        if "dropped" in frame.notes:
+            self.say(f"{frame.label}: {Dropped(*frame.notes['dropped']).text()}", "warning")
+        numbers = {"exposure": (prepared.exposure,), THIN_LENS: frame.thin_lens}
+        for name in model.frame_numbers:
+            if (number := numbers.get(name)) is not None:
+                value = torch.tensor(number, dtype=torch.float32)
+                buffers[name] = value if len(number) == 1 else value[None]
         return {name: value.to(self.settings.device) for name, value in buffers.items()}
 
     def _attention(self, buffers: dict[str, Tensor]) -> Attention | None:
@@ -334,6 +340,10 @@ class ClipDenoiser:
         }
         if isinstance(model, Denoiser) and source.class_path and not source.sha256 and source.init_args:
             facts["options"] = source.init_args
+        if model.per_sample and (constants := filled(prepared.frame, prepared.model)):
+            facts["filled"] = constants
+        if "dropped" in prepared.frame.notes:
+            facts["dropped"] = Dropped(*prepared.frame.notes["dropped"])._asdict()
         if prepared.reasons:
             facts["instead"] = list(prepared.reasons)
         return {"denoised": facts}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Protocol
 
-from data.buffers import buffer
+from data.buffers import SAMPLES, buffer
 from data.camera import Camera, DepthKind
 from data.derive import obtainable
 from data.frame import Frame
@@ -106,10 +106,15 @@ def advice(model: Model, has: Collection[str]) -> str:
 def replaced_pixels(frame: Frame) -> str | None:
     """Return which pixels of a frame are not what its file holds, in one sentence; None where all are.
 
-    From `notes["repaired"]`, pixels that were NaN or Inf, and `notes["outside_data_window"]`.
+    From `notes["repaired"]`, pixels that were NaN or Inf, and `notes["outside_data_window"]`. Samples that do
+    not count are not among them: see `data.dropped`.
     """
     parts = []
     for name, number in frame.notes.get("repaired", {}).items():
+        if name == SAMPLES:
+            far = "infinite distances of samples" if number > 1 else "infinite distance of a sample"
+            parts.append(f"{number} {far}, replaced by 0, that of a ray that left the scene")
+            continue
         neighbours = buffer(name).repair == "neighbours"
         by = "the mean of their finite neighbours, 0 where there are none" if neighbours else _no_hit(name)
         parts.append(f"{_pixels(number, name)} NaN or Inf, replaced by {by}")

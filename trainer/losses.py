@@ -41,24 +41,26 @@ class L1(nn.Module):
 
 
 class RelativeL2(nn.Module):
-    """Relative squared error, `mean (o - t)^2 / (t^2 + epsilon)`; Rousselle et al. 2011.
+    """Relative squared error, `factor * mean (o - t)^2 / (t^2 + epsilon)`; Rousselle et al. 2011.
 
     Args:
         epsilon: Keeps black pixels finite.
         symmetric: Divide by the square of the (detached) output instead of the target's, as
             Lehtinen et al. 2018 do, which keeps fireflies in a noisy target from dominating.
+        factor: 1, or 0.5 as in SBMC (Gharbi et al. 2019), AFGSA and ACFM.
     """
 
-    def __init__(self, epsilon: float = 0.01, symmetric: bool = False) -> None:
+    def __init__(self, epsilon: float = 0.01, symmetric: bool = False, factor: float = 1.0) -> None:
         super().__init__()
         self.epsilon = epsilon
         self.symmetric = symmetric
+        self.factor = factor
 
     def forward(self, output: Tensor, target: Tensor) -> Tensor:
         """Return the mean over all elements of (B, 3, H, W)."""
         output, target = output.float(), target.float()
         scale = output.detach() if self.symmetric else target
-        return (torch.square(output - target) / (torch.square(scale) + self.epsilon)).mean()
+        return self.factor * (torch.square(output - target) / (torch.square(scale) + self.epsilon)).mean()
 
 
 class TonemappedL2(nn.Module):

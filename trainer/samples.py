@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import re
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from data.buffers import SAMPLE_BUFFERS
+from data.dropped import Dropped
 from data.frame import Frame
 from models.layers import Layer
 from models.ops.per_sample import arranged, sample_counts
@@ -18,6 +21,9 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from trainer.denoising import Result
+
+LIGHT = ("radiance", "diffuse", "specular")
+"""What is denoised: no constant stands for it."""
 
 
 def sample_tensor(frame: Frame, model: Model) -> Tensor:
@@ -35,11 +41,48 @@ def sample_tensor(frame: Frame, model: Model) -> Tensor:
     try:
         return arranged(values, frame.samples.channels, model.samples, model.fill).contiguous()
     except ValueError as error:
-        raise ValueError(f"{frame.label}: {error}") from None
+        lacking = [n for n in model.samples if n not in frame.samples.names and n not in model.fill]
+        filling = " ".join(f"--fill {n}={SAMPLE_BUFFERS[n].no_hit:g}" for n in lacking if n not in LIGHT)
+        raise ValueError(f"{frame.label}: {error}" + (f" ({filling})" if filling else "")) from None
 
 
-def dropped(samples: Tensor) -> str | None:
-    """Return how many samples do not count, and pixels without any, in one sentence; None where all count.
+def fill(model: Model, texts: Sequence[str]) -> None:
+    """Set constants that stand for quantities where the samples of a frame lack them, beside the model's own.
+
+    Args:
+        model: A network or an exported file that reads samples.
+        texts: `QUANTITY=VALUE`, such as `lens=0`.
+
+    Raises:
+        UsageError: The model reads no samples, or not this quantity, or the value is no number.
+    """
+    if not texts:
+        return
+    if not model.per_sample:
+        raise UsageError(f"--fill {texts[0]}: the model reads no samples of each pixel, so nothing is filled")
+    guides = [name for name in model.samples if name not in LIGHT]
+    constants = dict(model.fill)
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in guides:
+            raise UsageError(f"--fill {text}: expected QUANTITY=VALUE with one of {', '.join(guides)}")
+        try:
+            constants[name] = float(value)
+        except ValueError:
+            constants[name] = math.nan
+        if not math.isfinite(constants[name]):
+            raise UsageError(f"--fill {text}: {value!r} is no finite number; expected one, as in {name}=0")
+    model.fill = constants
+
+
+def filled(frame: Frame, model: Model) -> dict[str, float]:
+    """Return the constants that stand for quantities which the samples of a frame lack."""
+    held = () if frame.samples is None else frame.samples.names
+    return {name: float(value) for name, value in model.fill.items() if name not in held}
+
+
+def dropped(samples: Tensor) -> Dropped | None:
+    """Return how many samples do not count, and pixels without any; None where all count.
 
     Args:
         samples: (B, S, C, H, W).
@@ -48,9 +91,7 @@ def dropped(samples: Tensor) -> str | None:
     lost = int(held * counts.numel() - counts.sum())
     if not lost:
         return None
-    pixels, empty = int((counts < held).sum()), int((counts == 0).sum())
-    text = f"{lost} samples with NaN or Inf in {pixels} pixels were dropped"
-    return f"{text}; {empty} pixels had no other and were filled from around them" if empty else text
+    return Dropped(lost, int((counts < held).sum()), int((counts == 0).sum()))
 
 
 def return_layers(loaded: Loaded) -> None:
@@ -74,17 +115,14 @@ def layer_pictures(result: Result) -> dict[str, Image]:
     Args:
         result: With the layers of a `models.Layer` as `aux`.
     """
+    from trainer.reports.composite import composite_sheet
     from trainer.reports.layers import layer_picture
-    from trainer.reports.pictures import Panel, grid, sized, tone_map
+    from trainer.reports.pictures import tone_map
 
+    color = result.frame.buffers["color"]
     pictures = {name: layer_picture(name, layer, result.exposure) for name, layer in result.aux.items()}
-    composite = tone_map(result.frame.buffers["color"], result.exposure)
-    rows: dict[str, list[Panel]] = {}
-    for name, picture in pictures.items():
-        layer, _, what = name.partition("_")
-        number = re.sub(r"\D", "", layer)
-        rows.setdefault(layer, []).append(Panel(sized(picture), f"layer {number}, {what}"))
-    last = [Panel(sized(tone_map(result.noisy, result.exposure)), "input, mean of the samples")]
-    last.append(Panel(sized(composite), "composite", f"exposure {result.exposure:.4g}"))
-    sheet = grid([*rows.values(), last], result.frame.label)
-    return {**pictures, "composite": composite, "layers": sheet}
+    images = {"mean of the samples": result.noisy, "composite": color}
+    if result.reference is not None:
+        images["reference"] = result.reference
+    sheet = composite_sheet(images, result.aux, result.exposure, result.frame.label)
+    return {**pictures, "composite": tone_map(color, result.exposure), "layers": sheet}

@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.dropped import mean, mean_of_hits, mean_variance
 from data.exr_image import HALF_MAX
 from data.frame import Frame, Image
 from data.layouts.channels import Gathering, missing_buffer
 from data.layouts.hdf5 import dataset, items, names, open_hdf5
-from data.layouts.samples import clean, mean_of_hits, mean_variance, means
+from data.layouts.samples import clean, means
 from data.layouts.scene import Scene, all_frames, require_folder
 from data.layouts.walk import LOOK, files_below
 
@@ -103,7 +104,7 @@ def read(scene: str, path: Path, reference: Path | None, index: int) -> Frame:
     raw["color"] = _radiance(raw["color"])
     kept = clean(_parts(raw), notes)
     gathering = Gathering(f"{scene}/frame {index}", notes=notes)
-    buffers = {"color": kept.get("radiance").mean(0, dtype=np.float32), **means(kept, _MEANS)}
+    buffers = {"color": mean(kept.get("radiance")), **means(kept, _MEANS)}
     buffers["depth"] = mean_of_hits(kept.get("depth"))
     if kept.count > 1:
         buffers["color_variance"] = mean_variance(kept.get("radiance"))

@@ -138,6 +138,7 @@ def read(folder: Path, index: int) -> Frame:
         camera=_camera(folder, entry),
         exposure=_exposure(folder, entry),
         spp=_spp(entry) or (None if frame.samples is None else frame.samples.count),
+        thin_lens=_thin_lens(folder, entry),
     )
 
 
@@ -162,6 +163,18 @@ def _camera(folder: Path, entry: dict[str, Any]) -> Camera | None:
     to_world = values.get("to_world")
     origin = None if to_world is None else np.asarray(to_world, np.float64)[:3, 3]
     return replace(camera, origin=origin)
+
+
+def _thin_lens(folder: Path, entry: dict[str, Any]) -> tuple[float, float, float] | None:
+    values = entry.get("camera") or {}
+    if "fov_x_degrees" not in values:
+        return None
+    aperture = values.get("aperture_radius") or 0.0
+    focus = (values.get("focus_distance") or 0.0) if aperture else 0.0
+    try:
+        return float(aperture), float(focus), float(values["fov_x_degrees"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{folder / _SIDECAR}, frame {entry['index']}: camera: {error}") from error
 
 
 def _exposure(folder: Path, entry: dict[str, Any]) -> float | None:

@@ -1,4 +1,4 @@
-"""Samples of foreign origin: brought into their ranges, and the images that their means and variances are."""
+"""Samples of foreign origin: brought into their ranges, and the images that their means are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.buffers import SAMPLE_BUFFERS
+from data.dropped import mark, mean
 from data.frame import Image, Samples
 
 _TOLERANCE = 1e-3
@@ -16,23 +17,24 @@ _TOLERANCE = 1e-3
 
 
 def clean(parts: dict[str, NDArray[np.float32]], notes: dict[str, Any]) -> Samples:
-    """Return samples of finite values within their ranges, in the order of the vocabulary.
+    """Return samples within their ranges, in the order of the vocabulary.
 
-    Values that are not finite become the quantity's value for a ray that left the scene, counted in
-    `notes["repaired"]["samples"]`; others are clipped, counted per quantity in `notes["clipped"]`.
+    Samples with a value that is not finite are marked and counted (`data.dropped`) in `notes["dropped"]`,
+    infinite distances replaced and counted in `notes["repaired"]["samples"]`; other values are clipped,
+    counted per quantity in `notes["clipped"]`.
 
     Args:
-        parts: Quantity → float32 (S, H, W, c), changed in place.
+        parts: Quantity → float32 (S, H, W, c).
         notes: Receives the counts.
     """
-    broken = 0
-    for name, values in parts.items():
-        entry = SAMPLE_BUFFERS[name]
-        bad = ~np.isfinite(values)
-        number = int(bad.sum())
-        if number:
-            values[bad] = entry.no_hit
-            broken += number
+    samples = Samples.of({name: parts[name] for name in SAMPLE_BUFFERS if name in parts})
+    dropped, replaced = mark(samples.values, samples.channels)
+    if dropped is not None:
+        notes["dropped"] = list(dropped)
+    if replaced:
+        notes.setdefault("repaired", {})["samples"] = replaced
+    for name in samples.names:
+        entry, values = SAMPLE_BUFFERS[name], samples.get(name)
         outside = 0
         if entry.low is not None:
             outside += int((values < entry.low - _TOLERANCE).sum())
@@ -42,25 +44,9 @@ def clean(parts: dict[str, NDArray[np.float32]], notes: dict[str, Any]) -> Sampl
             np.minimum(values, np.float32(entry.high), out=values)
         if outside:
             notes.setdefault("clipped", {})[f"samples.{name}"] = outside
-    if broken:
-        notes.setdefault("repaired", {})["samples"] = broken
-    return Samples.of({name: parts[name] for name in SAMPLE_BUFFERS if name in parts})
+    return samples
 
 
 def means(samples: Samples, names: Iterable[str]) -> dict[str, Image]:
-    """Return the mean of each named quantity that the samples have, (H, W, c)."""
-    return {name: samples.get(name).mean(0, dtype=np.float32) for name in names if name in samples.names}
-
-
-def mean_variance(values: NDArray[np.float32]) -> Image:
-    """Return the variance of the mean of independent samples (S, H, W, c), unbiased, 0 for one sample."""
-    count = values.shape[0]
-    if count < 2:
-        return np.zeros(values.shape[1:], np.float32)
-    return np.asarray(values.var(0, ddof=1, dtype=np.float64) / count, np.float32)
-
-
-def mean_of_hits(values: NDArray[np.float32]) -> Image:
-    """Return the mean over the samples that are not 0, and 0 where all are: depths, (H, W, c)."""
-    hit = values > 0
-    return np.asarray(values.sum(0) / np.maximum(hit.sum(0), 1), np.float32)
+    """Return the mean of each named quantity that the samples have, (H, W, c), NaN where none counts."""
+    return {name: mean(samples.get(name)) for name in names if name in samples.names}

@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from data.dropped import mean, mean_of_hits, mean_variance
 from data.frame import Frame
 from data.layouts.channels import Gathering
-from data.layouts.samples import clean, mean_of_hits, mean_variance, means
+from data.layouts.samples import clean, means
 from data.layouts.sbmc_tile import FLAGS, VERTICES, TileHeader, read_header, read_tile
 from data.layouts.scene import Scene, all_frames, require_folder
 from data.layouts.walk import LOOK, files_below
@@ -243,7 +244,7 @@ def _frame(
     notes: dict[str, Any] = {"assumed": dict(_ASSUMED), "normalised": ["depth", "first_depth"]}
     kept = clean(_parts(header, samples, flags), notes)
     gathering = Gathering(f"{scene}/frame {index}", notes=notes)
-    buffers = {"color": kept.get("radiance").mean(0, dtype=np.float32), **means(kept, _MEANS)}
+    buffers = {"color": mean(kept.get("radiance")), **means(kept, _MEANS)}
     buffers["depth"] = mean_of_hits(kept.get("depth"))
     if kept.count > 1:
         buffers["color_variance"] = mean_variance(kept.get("radiance"))
@@ -261,6 +262,7 @@ def _frame(
     }
     frame = gathering.frame(scene, index, header.sample_count, told)
     frame.samples = kept
+    frame.thin_lens = (header.aperture_radius, header.focus_distance, header.fov)
     frame.validate()
     return frame
 

@@ -126,7 +126,9 @@ def noisy_color(frame: Frame) -> Image:
 
 
 def _frame(tracer: Tracing, view: int, index: int, spp: int, buffers: dict[str, Image]) -> Frame:
-    return Frame(buffers, tracer.spec.name, index, tracer.pixel_camera(view), spp=spp)
+    seen = tracer.spec.views[view]
+    lens = (seen.aperture, seen.focus if seen.aperture > 0 else 0.0, seen.fov)
+    return Frame(buffers, tracer.spec.name, index, tracer.pixel_camera(view), spp=spp, thin_lens=lens)
 
 
 def _means(moments: Mapping[str, Moments]) -> dict[str, Image]:

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset, get_worker_info
 
 from data import augment_samples
 from data.augment import IMAGE_PLANE, UNCHANGED, Augmentation, Change, Turn, reordered, turn_vectors, turned
-from data.buffers import SAMPLES, buffer
+from data.buffers import SAMPLES, THIN_LENS, buffer
 from data.shards.read import CorruptSampleError, Sample, ShardReader
 
 Batch = dict[str, Any]
@@ -32,7 +32,7 @@ class Packed(NamedTuple):
     Attributes:
         pixels: float32, one after another each buffer's (B, C, H, W), (B, S, C, H, W) of `samples`.
         shapes: Name and shape of each.
-        numbers: Exposure, smallest and largest depth of each.
+        numbers: Exposure, smallest and largest depth, aperture, focus and field of view of each.
         samples: Scene, frame and key of each.
         channels: Channels of `samples`, where it is among the buffers.
         corrupt: Samples that were left out, with the reason.
@@ -42,7 +42,7 @@ class Packed(NamedTuple):
 
     pixels: Tensor
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
-    numbers: tuple[tuple[float, float, float], ...]
+    numbers: tuple[tuple[float, ...], ...]
     samples: tuple[tuple[str, int, str], ...]
     corrupt: tuple[tuple[str, str], ...]
     error: Exception | None = None
@@ -58,12 +58,13 @@ class Packed(NamedTuple):
             start += size
         numbers = torch.tensor(self.numbers, dtype=torch.float32)
         batch["exposure"] = numbers[:, 0].contiguous()
-        batch["depth_range"] = numbers[:, 1:].contiguous()
+        batch["depth_range"] = numbers[:, 1:3].contiguous()
         batch["scene"] = [scene for scene, _, _ in self.samples]
         batch["frame"] = torch.tensor([frame for _, frame, _ in self.samples], dtype=torch.int64)
         batch["key"] = [key for _, _, key in self.samples]
         if self.channels:
             batch["sample_channels"] = list(self.channels)
+            batch[THIN_LENS] = numbers[:, 3:].contiguous()
         return batch
 
 
@@ -166,9 +167,9 @@ class Batches(Dataset[Packed]):
     def _change(self, epoch: int, number: int) -> Change:
         return UNCHANGED if self.augmentation is None else self.augmentation.change(epoch, number)
 
-    def _numbers(self, epoch: int, number: int, sample: Sample) -> tuple[float, float, float]:
+    def _numbers(self, epoch: int, number: int, sample: Sample) -> tuple[float, ...]:
         factor = 1.0 if self.augmentation is None else self.augmentation.exposure_factor(epoch, number)
-        return (sample.exposure * factor, *sample.depth_range)
+        return (sample.exposure * factor, *sample.depth_range, *sample.thin_lens)
 
     def _fill(self, target: Tensor, number: int, name: str, change: Change) -> None:
         source = self._source(number, name, change.alone)
@@ -193,7 +194,8 @@ class Batches(Dataset[Packed]):
             )
         chosen = self.augmentation is not None and self.augmentation.samples is not None
         if len({sample.sample_channels for sample in samples}) > 1 or (len(held) > 1 and not chosen):
-            listed = ", ".join(f"{s.key}: {_kept(s)}" for s in samples)
+            kinds = {_kept(s): f"{s.scene}/frame {s.frame} has {_kept(s)}" for s in samples}
+            listed = ", ".join(kinds.values())
             raise ValueError(
                 f"one batch with different samples per pixel ({listed}); expected the same number and "
                 "channels: use a batch size of 1, or for training a number that all have: "
@@ -259,7 +261,7 @@ def _shape(samples: list[Sample], name: str, kept: int) -> tuple[int, ...]:
 
 def _kept(sample: Sample) -> str:
     stored = sample.buffers.get(SAMPLES)
-    return "none" if stored is None else f"{stored.shape[0]} of {len(sample.sample_channels)} channels"
+    return "none" if stored is None else f"{stored.shape[0]} of {len(sample.sample_channels)} channels each"
 
 
 def _size(samples: list[Sample]) -> tuple[int, int]:

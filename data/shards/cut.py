@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from data.buffers import SAMPLES
+from data.buffers import SAMPLES, THIN_LENS
 from data.exr import StoredFrame
 from data.frames import FrameSet
 from data.importance import importance_candidates, importance_map
 from data.manifest import FrameRecord
 from data.patches import Position
-from data.shards.division import Candidate, Place, ShardPlan
+from data.shards.division import Candidate, Place, ShardPlan, different_samples, kind_of
 from data.shards.index import write_json
 from data.shards.options import PrepareOptions
 from data.shards.planes import Planes
 from data.shards.write import ShardWriter
 from data.temporal import Accumulator
 
-CUT_VERSION = 1
+CUT_VERSION = 2
 """Part of the name of automatically prepared shards. Raise it whenever the same frames and options give
 other samples than before: when accumulation (`data.temporal`), derivation (`data.derive`), repair, cutting or
 the choice of positions (`data.patches`, `data.importance`) change. Otherwise shards in a cache, made by the
@@ -171,8 +171,16 @@ class _Cutter:
         arrays = {name: plane.cut(position, patch) for name, plane in planes.items()}
         height, width = arrays["reference"].shape[-2:]
         x, y = position if position is not None else (0, 0)
-        writer.per_sample = self.kept.per_sample
+        self._check_kind(writer)
         writer.add_stored({**self.kept.meta, "x": x, "y": y, "width": width, "height": height}, arrays)
+
+    def _check_kind(self, writer: ShardWriter) -> None:
+        """Check that the samples of a shard are all of one kind, which a manifest can have wrong."""
+        kind = self.kept.per_sample
+        if writer.samples and writer.per_sample != kind:
+            kinds = {kind_of(writer.per_sample): f"an earlier frame of {self.frame.scene}"}
+            raise ValueError(different_samples(kinds | {kind_of(kind): self.frame.label}))
+        writer.per_sample = kind
 
     def _candidates(self, split: str, count: int) -> list[Position | None]:
         known = self._positions.get((split, count))
@@ -215,4 +223,6 @@ def _keep(stored: StoredFrame, options: PrepareOptions) -> _Kept:
     except ValueError as error:
         raise ValueError(f"{frame.label}: {error}") from error
     meta["sample_channels"] = list(frame.samples.channels)
+    if frame.thin_lens is not None:
+        meta[THIN_LENS] = list(frame.thin_lens)
     return _Kept(planes, meta, (frame.samples.count, frame.samples.channels))

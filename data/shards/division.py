@@ -8,7 +8,7 @@ and whichever others exist already.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,6 +38,9 @@ class Candidate(NamedTuple):
     number: int
     total: int
 
+
+Kind = tuple[int | None, tuple[str, ...]] | None
+"""Samples per pixel that a frame keeps apart and their quantities; None: it keeps none."""
 
 Place = Position | Candidate | None
 """Where a sample is cut: a position, a candidate, or None for the whole frame."""
@@ -136,21 +139,40 @@ def _check_samples(frames: FrameSet, sources: dict[str, _Source], options: Prepa
     """Check, as far as the manifest tells, that batches of samples can be made."""
     if options.samples == "none":
         return
-    kinds: dict[tuple[int | None, tuple[str, ...]], str] = {}
+    kinds: dict[Kind, str] = {}
     for source in sources.values():
         for records in source.scenes.values():
             for record in records:
-                kind = (record.spp if record.samples else None, tuple(record.samples))
+                kind = (record.spp, tuple(record.samples)) if record.samples else None
                 kinds.setdefault(kind, record.file)
     if len(kinds) > 1:
-        told = [
-            f"{file} has {f'{spp} of {chr(44).join(names)}' if names else 'none'}"
-            for (spp, names), file in kinds.items()
-        ]
-        raise ValueError(
-            f"{frames.root}: frames that keep different samples apart cannot be in one set of shards: "
-            f"{told[0]}, {told[1]}; choose frames with --spp N, or leave samples out with --samples none"
-        )
+        raise ValueError(f"{frames.root}: {different_samples(kinds)}")
+
+
+def kind_of(stored: tuple[int, tuple[str, ...]] | None) -> Kind:
+    """Return the kind of samples with these channels, as `ShardRecord.per_sample` has them."""
+    if stored is None:
+        return None
+    return stored[0], tuple(dict.fromkeys(channel.partition(".")[0] for channel in stored[1]))
+
+
+def different_samples(kinds: Mapping[Kind, str]) -> str:
+    """Return what to tell about frames that keep different samples apart: which, how many, and the way out.
+
+    Args:
+        kinds: Samples per pixel and their quantities, None where a frame keeps none → where that is so.
+    """
+    alike = len({kind and kind[1] for kind in kinds}) == 1
+    told = []
+    for kind, where in kinds.items():
+        number = "no samples" if kind is None else f"{kind[0] or 'an unknown number of'} samples per pixel"
+        told.append(f"{where} has {number}" + ("" if kind is None or alike else f" of {', '.join(kind[1])}"))
+    more = f" and {len(told) - 3} more kinds" if len(told) > 3 else ""
+    return (
+        "frames that keep different samples apart cannot be in one set of shards, whose batches need the "
+        f"same number: {'; '.join(told[:3])}{more}. Choose frames with --spp N (in training --data.spp [N]), "
+        "or leave samples out with --samples none"
+    )
 
 
 def _scene_samples(

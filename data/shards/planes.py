@@ -2,6 +2,9 @@
 
 A frame is converted once, and patches are copied out of it; each patch decides for itself whether half
 precision holds it, so that a firefly elsewhere in the frame costs nothing.
+
+Samples that do not count stay NaN, in half precision as well: who reads a batch leaves them out, as in frames
+(`data.dropped`). Another sample of the pixel in their place would count twice.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data.buffers import SAMPLE_BUFFERS, SAMPLES, buffer
+from data.dropped import require_marked
 from data.frame import Image, Samples
 from data.patches import Position
 from data.repair import all_finite
@@ -44,13 +48,15 @@ class Planes:
         values: float32 (C, H, W), or (S, C, H, W) of samples, in any memory order; or float16, as it is
             stored.
         half: Half precision is allowed.
+        gaps: NaN is allowed, infinity is not.
 
     Raises:
         ValueError: A value is not finite; names the buffer.
     """
 
-    def __init__(self, name: str, values: NDArray[Any], half: bool) -> None:
-        if not all_finite(values):
+    def __init__(self, name: str, values: NDArray[Any], half: bool, gaps: bool = False) -> None:
+        self._gaps = not all_finite(values)
+        if self._gaps and not (gaps and not np.isinf(values).any()):
             raise ValueError(
                 f"buffer {name!r} has values that are not finite; ingest repairs them: trainer ingest"
             )
@@ -60,7 +66,7 @@ class Planes:
         if values.dtype == np.float16:
             self._half = values
         elif half:
-            self._all_in_range = max(float(values.max(initial=0)), -float(values.min(initial=0))) <= HALF_MAX
+            self._all_in_range = _largest(values) <= HALF_MAX
             with np.errstate(over="ignore"):  # a patch with such a value is taken from `values`
                 self._half = values.astype("<f2", order="C")
 
@@ -76,13 +82,20 @@ class Planes:
         Args:
             samples: The samples of a frame.
             half: In half precision whatever they are, radiance clipped to [0, 65504]; otherwise only where it
-                is precise enough for every quantity.
+                is precise enough for every quantity. Patches with larger numbers, and frames whose depths are
+                too small for it, are kept in float32 anyway.
+
+        Raises:
+            ValueError: A value is not finite, in a sample that is not marked as dropped.
         """
+        require_marked(samples.values, samples.channels)
         values = np.ascontiguousarray(samples.values.transpose(0, 3, 1, 2))
         if half and "radiance" in samples.names:
             first = samples.channels.index("radiance.R")
             np.clip(values[:, first : first + 3], 0, HALF_MAX, out=values[:, first : first + 3])
-        return Planes(SAMPLES, values, half or all(SAMPLE_BUFFERS[name].half for name in samples.names))
+        wide = [samples.get(name) for name in samples.names if not SAMPLE_BUFFERS[name].half]
+        halves = all(half and not 0 < _largest(quantity) < HALF_FLOOR for quantity in wide)
+        return Planes(SAMPLES, values, halves, gaps=True)
 
     def cut(self, position: Position | None, patch: int) -> Stored:
         """Return a patch in the type in which it is stored, a view where it lies inside; None: everything.
@@ -93,7 +106,8 @@ class Planes:
             return _window(self.values, position, patch)
         half = _window(self._half, position, patch)
         # Most often one pixel tells that the patch is not among the subnormal numbers.
-        if self._all_in_range and _magnitude(half[..., half.shape[-2] // 2, half.shape[-1] // 2]) >= _FLOOR:
+        middle = half[..., half.shape[-2] // 2, half.shape[-1] // 2]
+        if self._all_in_range and not self._gaps and _magnitude(middle) >= _FLOOR:
             return half
         if self.values is self._half:
             largest = _magnitude(half)
@@ -110,8 +124,14 @@ class Planes:
 
 
 def _in_range(array: NDArray[np.float32]) -> bool:
-    largest = float(max(array.max(initial=0), -array.min(initial=0)))
+    largest = _largest(array)
     return largest == 0.0 or HALF_FLOOR <= largest <= HALF_MAX
+
+
+def _largest(array: NDArray[np.float32]) -> float:
+    """Return the largest magnitude, NaN left out."""
+    largest = max(float(array.max(initial=0)), -float(array.min(initial=0)))
+    return largest if largest == largest else float(np.fmax.reduce(np.abs(array), axis=None, initial=0))
 
 
 def _magnitude(array: NDArray[np.float16]) -> int:

@@ -22,7 +22,7 @@ from typing import Any
 
 from data.frames import FrameSet
 from data.shards.cut import CUT_VERSION, make_scene
-from data.shards.division import ShardPlan, plan_shards
+from data.shards.division import Kind, ShardPlan, different_samples, kind_of, plan_shards
 from data.shards.estimate import announcement, check_room, estimate
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
 from data.shards.options import PrepareOptions
@@ -81,8 +81,8 @@ def prepare(
             "manifest_hash": frames.manifest.hash,
             "options": options.to_dict(),
         }
+        plans = plan_shards(frames, options)  # fails before anything is left behind
         _open_work(work, identity, force)
-        plans = plan_shards(frames, options)
         records = _make_all(frames, work, plans, options, processes, progress or (lambda done, total: None))
         _check_samples(records)
         manifest = frames.manifest
@@ -176,23 +176,12 @@ def _check_samples(records: list[ShardRecord]) -> None:
     Raises:
         ValueError: They do not.
     """
-    kinds: dict[tuple[int, tuple[str, ...]] | None, str] = {}
+    kinds: dict[Kind, str] = {}
     for record in records:
         if record.samples:
-            kinds.setdefault(record.per_sample, f"{record.scene} ({record.split})")
+            kinds.setdefault(kind_of(record.per_sample), f"{record.scene} ({record.split})")
     if len(kinds) > 1:
-        told = [f"{where} has {_kind_text(kind)}" for kind, where in list(kinds.items())[:2]]
-        raise ValueError(
-            f"frames that keep different samples apart cannot be in one set of shards: {' and '.join(told)}; "
-            "choose frames with --spp N, or leave samples out with --samples none"
-        )
-
-
-def _kind_text(kind: tuple[int, tuple[str, ...]] | None) -> str:
-    if kind is None:
-        return "none"
-    count, channels = kind
-    return f"{count} of {', '.join(dict.fromkeys(channel.partition('.')[0] for channel in channels))}"
+        raise ValueError(different_samples(kinds))
 
 
 def _record(work: Path, file: str) -> ShardRecord:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from data.buffers import THIN_LENS
 from data.shards.index import Index
 
 DTYPES = {"<f2": torch.float16, "<f4": torch.float32}
@@ -67,6 +68,7 @@ class Sample(NamedTuple):
     shard: int
     buffers: dict[str, Stored]
     sample_channels: tuple[str, ...] = ()
+    thin_lens: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class ShardReader:
@@ -206,6 +208,7 @@ def _parse(key: str, raw: memoryview, offset: int, shard: int) -> Sample:
         first = (start + entry["offset"]) // dtype.itemsize
         buffers[entry["name"]] = Stored(dtype, tuple(entry["shape"]), first)
     low, high = meta["depth_range"]
+    aperture, focus, view = meta.get(THIN_LENS, (0.0, 0.0, 0.0))
     return Sample(
         key,
         meta["scene"],
@@ -218,4 +221,5 @@ def _parse(key: str, raw: memoryview, offset: int, shard: int) -> Sample:
         shard,
         buffers,
         tuple(meta.get("sample_channels", ())),
+        (aperture, focus, view),
     )

@@ -12,7 +12,9 @@ from trainer import configs
 
 SMOKE = "smoke.yaml"
 SAMPLES = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
-SAMPLES |= {f"{name}_sample.yaml": f"{name}_random.yaml" for name in ("layers", "pixelgather", "samplesplat")}
+SAMPLES |= {
+    f"{name}_sample.yaml": f"{name}_random.yaml" for name in ("layers", "pixelgather", "samplesplat", "sbmc")
+}
 SAMPLES["layers_optimized_sample.yaml"] = "layers_optimized.yaml"
 """Overlay → what it is laid over."""
 
@@ -22,7 +24,10 @@ NARROW = {
     "kpcn_tungsten.yaml": {"net.init_args": {"layers": 2, "width": 4}},
     **{
         f"{name}.yaml": {"net.init_args": {"width": 4, "kernel_size": 5}}
-        for name in ("layers_random", "pixelgather_random", "samplesplat_random", "layers_optimized")
+        for name in (
+            *("layers_random", "pixelgather_random", "samplesplat_random", "layers_optimized"),
+            "sbmc_random",
+        )
     },
 }
 """Networks whose published size would take a minute for a step; their tests build them in that size."""

@@ -8,6 +8,8 @@ import pytest
 from data.augment import ORDERS, Augmentation, Change, Turn, turned
 from data.augment_samples import changed, moves, subset
 from data.buffers import sample_channels
+from data.exr import read_frame
+from data.root import resolve_root
 
 CHANNELS = sample_channels("radiance", "normal", "motion", "lens", "offset", "depth")
 TURNS = [Turn(number) for number in range(8)]
@@ -65,6 +67,20 @@ def test_angles_of_unknown_axes_are_refused_by_name() -> None:
     moves(channels, Change(colors=(1, 0, 2)))
     with pytest.raises(ValueError, match="samples with light_direction are not flipped"):
         moves(channels, Change(Turn.FLIP_Y))
+
+
+@pytest.mark.parametrize("scene", ["outdoor-000101", "indoor-000102"])
+def test_rendered_lens_positions_are_to_the_left_and_up(scene: str) -> None:
+    """Behind the focus a point moves against the position on the lens: to the right for one on the left."""
+    samples = read_frame(resolve_root("sample:layers").path / scene / "f000.exr").samples
+    assert samples is not None
+    lens, radius = samples.get("lens"), samples.get("coc")[..., 0].mean(0) / 2
+    lens = lens - lens.mean(0)
+    seen = samples.get("normal")[..., 0]
+    down, right = np.gradient(seen.mean(0))
+    moved = (lens * (seen - seen.mean(0))[..., None]).sum(0) / (lens**2).sum(0)
+    for axis, gradient in enumerate((right, down)):
+        assert np.corrcoef(moved[..., axis].ravel(), (radius * gradient).ravel())[0, 1] > 0.15
 
 
 def test_every_sample_is_kept_about_equally_often() -> None:

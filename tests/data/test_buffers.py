@@ -29,5 +29,5 @@ def test_an_unknown_name_lists_the_known_ones():
         buffer("colour")
 
 
-def test_frame_numbers_are_exposure_and_depth_range():
-    assert FRAME_NUMBERS == {"exposure": 1, "depth_range": 2}
+def test_frame_numbers_are_exposure_depth_range_and_the_lens():
+    assert FRAME_NUMBERS == {"exposure": 1, "depth_range": 2, "thin_lens": 3}

@@ -94,7 +94,9 @@ def test_overflowed_radiance_is_the_largest_half_and_broken_values_are_counted(t
     frame = next(layerdenoise.frames(tmp_path))
     assert frame.samples.get("radiance")[0, 1, 1, 0] == 65504
     assert frame.buffers["reference"][4, 4, 2] == 65504
-    assert frame.notes["repaired"] == {"samples": 1}
+    assert "repaired" not in frame.notes
+    assert frame.notes["dropped"] == [1, 1, 0]
+    assert np.isnan(frame.samples.values[1, 2, 2]).all()
     assert frame.notes["clipped"] == {"samples.diffuse_albedo": 1}
 
 

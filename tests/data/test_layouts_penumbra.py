@@ -36,6 +36,27 @@ def test_a_video_has_reflectances_camera_exposure_and_reference(tmp_path):
     assert frame.camera.centre() == pytest.approx(original.camera.centre())
 
 
+def test_the_lens_is_that_of_the_sidecar_and_a_pinhole_has_no_focus(tmp_path):
+    folder = penumbra_scene(tmp_path, "classroom")
+    (scene,) = penumbra.describe(tmp_path)
+    assert scene.read(0).thin_lens is None
+    edit(folder, lambda s: s["frames"][0]["camera"].update(fov_x_degrees=39.0, focus_distance=2.5))
+    assert scene.read(0).thin_lens == (0.0, 0.0, 39.0)
+    edit(folder, lambda s: s["frames"][0]["camera"].update(aperture_radius=0.125))
+    assert scene.read(0).thin_lens == (0.125, 2.5, 39.0)
+    edit(folder, lambda s: s["frames"][0]["camera"].update(aperture_radius="wide"))
+    with pytest.raises(ValueError, match=r"sequence\.json, frame 0: camera"):
+        scene.read(0)
+
+
+@pytest.mark.shared
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the shared data set")
+def test_shared_layer_frames_have_their_lens():
+    scenes = {scene.name: scene for scene in penumbra.describe(SHARED / "layers")}
+    assert scenes["cbox-glossy"].read(0).thin_lens == pytest.approx((0.118466, 2.961646, 39.0), abs=1e-6)
+    assert scenes["veach-lamp"].read(0).thin_lens[:2] == (0, 0)
+
+
 def test_stills_have_halves_and_variances_and_are_no_sequence(tmp_path):
     penumbra_scene(tmp_path, "classroom", kind="stills")
     scene = penumbra.describe(tmp_path)[0]

@@ -284,6 +284,11 @@ def test_a_process_with_little_memory_survives_hostile_tiles(tmp_path):
     assert resource.getrlimit(resource.RLIMIT_AS)[0] != 0
 
 
+def test_a_tile_has_the_lens_of_its_camera_in_its_own_units(tmp_path):
+    sbmc_tile(tmp_path / "s" / "t.bin")
+    assert next(sbmc.frames(tmp_path)).thin_lens == (0.25, 0.125, 45.0)
+
+
 def test_broken_and_impossible_values_of_samples_are_counted(tmp_path):
     pixels, floats, flags = sbmc_arrays(1, SBMC_HEADER)
     floats[0, 5, 3, 3] = np.nan
@@ -292,10 +297,14 @@ def test_broken_and_impossible_values_of_samples_are_counted(tmp_path):
     (tmp_path / "s").mkdir()
     hostile(tmp_path / "s" / "t.bin", sbmc_blocks(pixels, floats, flags))
     frame = next(sbmc.frames(tmp_path))
-    assert frame.notes["repaired"]["samples"] == 2
-    assert frame.notes["repaired"]["reference"] == 1
+    assert frame.notes["dropped"] == [1, 1, 0]
+    assert frame.notes["repaired"] == {"reference": 1, "reference_diffuse": 1}
     assert frame.notes["clipped"]["samples.specular"] == 1
-    assert np.isfinite(frame.samples.values).all()
+    gone = np.isnan(frame.samples.values)
+    assert gone[0, 3, 3].all()
+    assert gone.sum() == gone[0, 3, 3].sum()
+    others = frame.samples.get("radiance")[1:, 3, 3].mean(0)
+    assert np.allclose(frame.buffers["color"][3, 3], others)
     assert all(np.isfinite(b).all() for b in frame.buffers.values())
 
 

@@ -382,7 +382,7 @@ def test_a_root_is_prepared_here_by_recipe_and_samples_per_pixel(tmp_path: Path)
     assert (options.sampling, options.candidates, options.spp) == ("importance", 400, (8,))
     assert (options.recipe, options.train_patches, options.accumulate) == ("afgsa", 80, False)
     assert Shards(str(root)).options == PrepareOptions()
-    assert Shards("sample:bmfr", recipe="layers").options.train_patches == 56
+    assert Shards(str(root), recipe="layers").options.train_patches == 56
 
 
 def test_training_batches_keep_a_random_number_of_samples_and_evaluation_all(tmp_path: Path):

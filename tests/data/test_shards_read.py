@@ -307,7 +307,7 @@ def test_different_sample_counts_in_one_batch_are_named_unless_all_have_enough(s
     fewer = stored._replace(shape=(2, *stored.shape[1:]))
     reader._samples[1] = reader.sample(1)._replace(buffers={**reader.sample(1).buffers, "samples": fewer})
     with pytest.raises(
-        ValueError, match=r"different samples per pixel \(.*: 4 of .*: 2 of .*--data.sample_counts"
+        ValueError, match=r"\(\w+/frame \d has 4 of .*, \w+/frame \d has 2 of .*--data.sample_counts"
     ):
         Batches(reader, ("samples",), False)[Order(0, (0, 1))]
     some = Batches(reader, ("samples",), False, augmentation=Augmentation("none", samples=(1, 8)))

@@ -43,6 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="option of a method that is named by its class, such as window=5 or features=normal,albedo; "
         "may be repeated (`trainer models NFOR` lists those of NFOR)",
     )
+    parser.add_argument(
+        "--fill",
+        action="append",
+        default=[],
+        metavar="QUANTITY=VALUE",
+        help="constant that stands for a quantity where samples lack it, such as lens=0 or time=0.5, for "
+        "models that read the samples of each pixel; may be repeated",
+    )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for the results")
     parser.add_argument(
         "--png", action="store_true", help="also write tone-mapped pictures, and comparisons with a reference"
@@ -112,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     from trainer.outputs import make_folder, refuse_existing
     from trainer.progress import FrameProgress
     from trainer.results import Wanted, write
-    from trainer.samples import return_layers
+    from trainer.samples import fill, return_layers
     from trainer.sequences import denoiser_of
 
     _check_device(args.device)
@@ -128,6 +136,7 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(
         number, args.exposure == "auto", not args.no_accumulate, args.memory, args.device, args.attention
     )
+    fill(loaded.model, args.fill)
     if args.layers:
         return_layers(loaded)
     kernels = Kernels(loaded.model, args.device)

@@ -69,9 +69,12 @@ def run(args: argparse.Namespace) -> int:
     console = Console()
     console.print(table)
     sizes = ", ".join(f"{batch} x {width}x{height}" for batch, height, width in parity.sizes)
+    of_samples = ""
+    if parity.counts:
+        of_samples = f", {', '.join(map(str, parity.counts))} samples per pixel"
     console.print(
-        f"Largest relative difference over {sizes} (images x size), with fireflies, with and without frame "
-        f"numbers; allowed {parity.limit:g}.",
+        f"Largest relative difference over {sizes} (images x size){of_samples}, with fireflies, with and "
+        f"without frame numbers; allowed {parity.limit:g}.",
         highlight=False,
     )
     return 0

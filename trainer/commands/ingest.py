@@ -9,7 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data.buffers import SAMPLES
+
 if TYPE_CHECKING:
+    from data.dropped import Dropped
     from data.ingestion import Progress
     from data.manifest import Manifest
 
@@ -119,6 +122,8 @@ def report(manifest: Manifest, output: Path) -> None:
     """Print scenes, splits, and what was derived or repaired."""
     from rich.console import Console
 
+    from data.dropped import total
+
     console = Console()
     console.print(scene_table(manifest))
     stored = dict.fromkeys(b for s in manifest.scenes.values() for f in s.frames for b in f.buffers)
@@ -128,6 +133,8 @@ def report(manifest: Manifest, output: Path) -> None:
         console.print(f"stored per sample: {', '.join(apart)}", highlight=False, soft_wrap=True)
     repaired: Counter[str] = Counter()
     derived: dict[str, str] = {}
+    frames = [frame for scene in manifest.scenes.values() for frame in scene.frames]
+    dropped = total(told for frame in frames if (told := frame.remarks.get("dropped")))
     for scene in manifest.scenes.values():
         for frame in scene.frames:
             repaired.update(frame.repaired)
@@ -136,13 +143,29 @@ def report(manifest: Manifest, output: Path) -> None:
         console.print(f"derived on reading: {name} = {rule}", highlight=False, soft_wrap=True)
     for line in remarks(manifest):
         console.print(line, highlight=False, soft_wrap=True)
-    for name, count in repaired.items():
-        console.print(f"repaired: {count} pixels of {name} were NaN or Inf", highlight=False, soft_wrap=True)
+    for line in repairs(repaired, dropped):
+        console.print(line, highlight=False, soft_wrap=True)
     console.print(
         f"{output}: {manifest.frame_count} frames; next: trainer prepare {output} --output SHARDS",
         highlight=False,
         soft_wrap=True,
     )
+
+
+def repairs(repaired: Mapping[str, int], dropped: Dropped | None) -> list[str]:
+    """Return what was not finite, a sentence for each buffer.
+
+    Args:
+        repaired: Buffer → number of pixels; `samples` → number of infinite distances.
+        dropped: Samples that do not count.
+    """
+    lines = [
+        f"repaired: {count} infinite distances of samples are those of rays that left the scene"
+        if name == SAMPLES
+        else f"repaired: {count} pixels of {name} were NaN or Inf"
+        for name, count in repaired.items()
+    ]
+    return lines if dropped is None else [*lines, f"samples: {dropped.text()}"]
 
 
 def remarks(manifest: Manifest) -> list[str]:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from data.dropped import Dropped
+
 HELP = "say what a file, a data set or shards contain"
 
 
@@ -132,6 +134,8 @@ def _print_frame(found: Mapping[str, Any], console: Console, title: str = "") ->
     if found["samples"]:
         apart = found["samples"]
         _line(console, f"samples: {apart['count']} per pixel, each with {', '.join(apart['quantities'])}")
+        if lost := _dropped(apart):
+            _line(console, f"samples: {lost.text()}")
     for name, rule in found["derived"].items():
         _line(console, f"derived: {name} = {rule}")
     if found["ignored"]:
@@ -168,7 +172,7 @@ def _print_set(found: Mapping[str, Any], console: Console) -> None:
     from rich import box
     from rich.table import Table
 
-    from trainer.commands.ingest import frames_text
+    from trainer.commands.ingest import frames_text, repairs
 
     _line(console, f"{found['path']}: data set {found['name']!r}, {found['frames']} frames")
     _line(console, f"layout {found['layout']}, depth {found['depth']}, hash {found['hash']}")
@@ -192,13 +196,20 @@ def _print_set(found: Mapping[str, Any], console: Console) -> None:
     for name, s in found["scenes"].items():
         if s["credit"]:
             _line(console, f"{name}: {s['credit']}; {s['provenance']}")
-        for buffer, count in s["repaired"].items():
-            _line(console, f"{name}: {count} pixels of {buffer} were NaN or Inf and are repaired")
+        for line in repairs(s["repaired"], _dropped(s)):
+            _line(console, f"{name}: {line}")
     if found["notes"]:
         _line(console, found["notes"])
     _print_problems(found, console)
     for name, frame in found["first_frames"].items():
         _print_frame(frame, console, f"\n{name}, first frame")
+
+
+def _dropped(found: Mapping[str, Any]) -> Dropped | None:
+    from data.dropped import Dropped
+
+    lost = Dropped(**found["dropped"])
+    return lost if lost.samples else None
 
 
 def _print_layout(found: Mapping[str, Any], console: Console) -> None:

@@ -31,6 +31,7 @@ class Regression(Evaluated):
         clip_norm: Gradients are scaled down to this norm, before `clip_value`; the trainer's
             `gradient_clip_val` does one of both.
         clip_value: Every number of a gradient is clipped to +- this.
+        pairs: Compare what the method's paper compares (`Denoiser.training_pairs`) instead.
     """
 
     def __init__(
@@ -41,27 +42,31 @@ class Regression(Evaluated):
         lr_scheduler: MakeSchedule | None = None,
         clip_norm: float | None = None,
         clip_value: float | None = None,
+        pairs: bool = False,
     ) -> None:
         super().__init__(net)
         self.keep_arguments()
         check_number("clip_norm", clip_norm)
         check_number("clip_value", clip_value)
-        self.clip_norm, self.clip_value = clip_norm, clip_value
+        self.clip_norm, self.clip_value, self.pairs = clip_norm, clip_value, pairs
         self.loss = loss if loss is not None else SMAPE()
         self.make_optimizer = optimizer
         self.make_lr_scheduler = lr_scheduler
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of one batch."""
-        output, target = self.exposed(batch)
-        loss: Tensor = self.loss(output, target)
-        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=len(target))
+        loss = self._compared(batch) if self.pairs else self.loss(*self.exposed(batch))
+        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=len(batch["reference"]))
         return loss
 
     def validation_loss(self, batch: Batch, output: Tensor, target: Tensor) -> Tensor:
-        """Return the loss of exposed output and reference."""
-        loss: Tensor = self.loss(output, target)
+        """Return the loss of exposed output and reference, or of what the method's paper compares."""
+        loss: Tensor = self._compared(batch) if self.pairs else self.loss(output, target)
         return loss
+
+    def _compared(self, batch: Batch) -> Tensor:
+        pairs = self.net.training_pairs(batch).values()
+        return torch.stack([self.loss(pair.output, pair.target) for pair in pairs]).sum()
 
     def configure_gradient_clipping(
         self,

@@ -12,6 +12,7 @@ import numpy as np
 
 from data.buffers import buffer
 from data.derive import derive
+from data.dropped import mean
 from data.duplicates import Fingerprint, fingerprint
 from data.exr import RadianceWarning, looks_encoded, read_frame
 from data.frame import Frame
@@ -20,6 +21,7 @@ from data.importance import CANDIDATES, importance_map, importance_positions
 from data.inspection import describe_frame
 from data.manifest import MANIFEST, FrameRecord
 from data.patches import patch_count, uniform_positions
+from data.repair import repair
 from data.shards.cut import PrepareOptions
 from data.statistics import (
     Histogram,
@@ -173,8 +175,8 @@ def _with_color(frame: Frame) -> Frame:
     samples = frame.samples
     if samples is None or "color" in frame.buffers or "radiance" not in samples.names:
         return frame
-    mean = samples.get("radiance").mean(0, dtype=np.float64).astype(np.float32)
-    frame = frame.with_buffers(color=mean)
+    repaired, _ = repair({"color": mean(samples.get("radiance"))})
+    frame = frame.with_buffers(**repaired)
     return derive(frame, ["irradiance"]) if "albedo" in frame.buffers else frame
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from data.render.frames import noisy_frames
 from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
 from data.render.references import Reference, energy_z
 from data.render.views import ViewWork, add_pass, render_view
-from tests.data.render.fake_tracer import FakeTracer
+from tests.data.render.fake_tracer import FakeTracer, spec
 
 STILLS = Recipe("stills", 24, 16, (2, 4), 64)
 
@@ -181,6 +182,15 @@ def test_frames_of_a_view_are_made_one_after_the_other():
     assert sum(counts) == 24 * 16 * 2
     assert [frame.spp for frame in frames] == [4]
     assert sum(counts) == 24 * 16 * 4
+
+
+def test_frames_say_through_which_lens_they_were_rendered():
+    scene = spec()
+    lens = replace(scene.views[0], aperture=0.25, focus=3.0)
+    recipe = Recipe("samples", 24, 16, (2,), 64)
+    (pinhole,) = noisy_frames(FakeTracer(scene), 0, recipe, 1)
+    (wide,) = noisy_frames(FakeTracer(replace(scene, views=(lens,))), 0, recipe, 1)
+    assert (pinhole.thin_lens, wide.thin_lens) == ((0, 0, 40.0), (0.25, 3.0, 40.0))
 
 
 def test_standard_errors_of_the_energy_have_unit_spread():
