@@ -64,8 +64,12 @@ class RelativeL2(nn.Module):
 
 
 class TonemappedL2(nn.Module):
-    """Mean squared difference of sRGB(log(1 + x)), of Munkberg and Hasselgren 2020, section 4."""
+    """Mean squared difference of sRGB(log(1 + x)), of Munkberg and Hasselgren 2020, section 4.
+
+    Radiance is clipped to [0, 65536]; the authors' lower bound of 1e-5, for what networks see, would leave
+    black output without a gradient.
+    """
 
     def forward(self, output: Tensor, target: Tensor) -> Tensor:
         """Return the mean over all elements of (B, 3, H, W)."""
-        return (srgb_log(output.float()) - srgb_log(target.float())).square().mean()
+        return (srgb_log(output.float(), 0.0) - srgb_log(target.float(), 0.0)).square().mean()

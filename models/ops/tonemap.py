@@ -41,16 +41,17 @@ def gamma(radiance: Tensor) -> Tensor:
     return torch.where(dark, bounded * (_DARKEST ** (GAMMA - 1.0)), curve)
 
 
-def srgb_log(radiance: Tensor) -> Tensor:
-    """Return sRGB(log(1 + x)) of radiance x clipped to [1e-5, 65536], in float32 or wider: [1.3e-4, 2.7].
+def srgb_log(radiance: Tensor, darkest: float = 1e-5) -> Tensor:
+    """Return sRGB(log(1 + x)) of radiance x clipped to [darkest, 65536], in float32 or wider, up to 2.7.
 
     Args:
         radiance: Exposed linear radiance of any shape.
+        darkest: Lower bound; the gradient is 0 below it.
 
     Source: equations 7 and 8 of Munkberg and Hasselgren 2020 (doi:10.1111/cgf.14049); the bounds are those
     of the authors' code.
     """
-    value = torch.log1p(wide(radiance).clamp(1e-5, 65536.0))
+    value = torch.log1p(wide(radiance).clamp(darkest, 65536.0))
     curve = 1.055 * value.clamp_min(_SRGB_LINEAR).pow(1 / 2.4) - 0.055
     return torch.where(value > _SRGB_LINEAR, curve, 12.92 * value)
 
