@@ -104,8 +104,9 @@ def test_frames_with_different_numbers_of_samples_are_refused(tmp_path, monkeypa
     place = (frames, "--output", tmp_path / "shards", *ARGUMENTS)
     assert command(monkeypatch, *place) == 1
     message = capsys.readouterr().err
-    assert "hall/f000.exr has 4 of radiance,normal,roughness, hall/f001.exr has 8 of" in message
-    assert "choose frames with --spp N, or leave samples out with --samples none" in message
+    assert "hall/f000.exr has 4 samples per pixel; hall/f001.exr has 8 samples per pixel" in message
+    assert "Choose frames with --spp N" in message
+    assert "or leave samples out with --samples none" in message
     assert command(monkeypatch, *place, "--spp", 8, "--force") == 0
     assert "8 samples of 7 channels per pixel are kept apart" in capsys.readouterr().out
     index = prepare(frames, tmp_path / "without", replace(OPTIONS, samples="none"))
@@ -119,7 +120,7 @@ def test_a_number_of_samples_that_the_manifest_does_not_tell_is_refused_before_p
     }  # both say 1 sample per pixel
     splits: dict[str, list[str]] = {"train": ["hall", "roof"], "validation": [], "test": []}
     Manifest("odd", "penumbra", "euclidean", splits, scenes).save(tmp_path / "frames")
-    with pytest.raises(ValueError, match=r"hall \(train\) has 2 of radiance.* and roof \(train\) has 3 of"):
+    with pytest.raises(ValueError, match=r"hall \(train\) has 2 samples .*; roof \(train\) has 3 samples"):
         prepare(tmp_path / "frames", tmp_path / "shards", OPTIONS)
     assert not (tmp_path / "shards").exists()
 
