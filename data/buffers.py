@@ -313,6 +313,11 @@ SAMPLES = "samples"
 """Name under which the samples of each pixel are stored, (S, C, H, W), and read by networks."""
 
 
+MAY_BE_INFINITE = frozenset({"depth", "first_depth", "position", "path_probability"})
+"""Per-sample quantities whose infinity has a meaning: a ray that left the scene, or a direction without
+alternative. It is read as the value of a ray that left the scene."""
+
+
 def sample_channels(*names: str) -> tuple[str, ...]:
     """Return the channels of per-sample quantities in order, such as `normal.X`, `normal.Y`, `normal.Z`.
 

@@ -16,13 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import SAMPLE_BUFFERS
+from data.buffers import MAY_BE_INFINITE, SAMPLE_BUFFERS
 from data.repair import all_finite
 
 Values = NDArray[np.float32]
-
-MAY_BE_INFINITE = frozenset({"depth", "first_depth", "position", "path_probability"})
-"""Quantities whose infinity has a meaning: a ray that left the scene, or a direction without alternative."""
 
 
 class Dropped(NamedTuple):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from data.buffers import FRAME_NUMBERS, SAMPLES, buffer, sample_channels
-from models.ops.per_sample import arranged
+from models.ops.per_sample import arranged, check_samples
 
 Buffers = Mapping[str, Tensor]
 
@@ -70,6 +70,8 @@ class Denoiser(nn.Module):
         frame_halo: Frames on each side that the exact result of a frame depends on.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
+        exported_bytes_per_pixel: `bytes_per_pixel` of exported files, where it is more than half as much
+            again; 0: it is not.
         no_export: Why the method is not exported as ONNX or TorchScript; empty where it is.
         targets: Names of the buffers that training compares with.
         compared: Names of the pairs that `training_pairs` returns.
@@ -87,6 +89,7 @@ class Denoiser(nn.Module):
     frame_halo: int = 0
     bytes_per_pixel: int = 500
     bytes_once: int = 0
+    exported_bytes_per_pixel: int = 0
     no_export: str = ""
     targets: tuple[str, ...] = ("reference",)
     compared: tuple[str, ...] = ("color",)
@@ -176,6 +179,12 @@ class Denoiser(nn.Module):
                 f"{type(self).__name__} needs the buffers {', '.join(self.inputs)}; "
                 f"missing: {', '.join(missing)}; given: {', '.join(buffers) or 'none'}"
             )
+        for name in self.inputs:
+            if not isinstance(buffers[name], Tensor):
+                raise ValueError(
+                    f"{type(self).__name__}: buffer {name!r} is a {type(buffers[name]).__name__}, expected "
+                    "one tensor; images of different size or number of samples need a call each"
+                )
         sizes = buffers[self.inputs[0]].shape
         batch, height, width = sizes[0], sizes[-2], sizes[-1]
         if torch.jit.is_tracing() or torch.compiler.is_exporting():
@@ -194,13 +203,7 @@ class Denoiser(nn.Module):
         """Return the sizes expected between batch and rows: channels, of `samples` also their number."""
         if name != SAMPLES:
             return (buffer(name).channels,)
-        channels, shape = sample_channels(*self.samples), buffers[name].shape
-        if len(shape) != 5 or shape[1] == 0 or shape[2] != len(channels):
-            raise ValueError(
-                f"{type(self).__name__}: buffer 'samples' has shape {tuple(shape)}, expected (B, S, "
-                f"{len(channels)}, H, W) with at least one sample and the channels {', '.join(channels)}"
-            )
-        return (shape[1], len(channels))
+        return check_samples(buffers[name], sample_channels(*self.samples), type(self).__name__)
 
     def exposure(self, buffers: Buffers) -> Tensor:
         """Return the exposure as (B, 1, 1, 1), 1 where the mapping has none or one that is not positive."""

@@ -24,14 +24,16 @@ the image is dropped. Where paper and the authors' code disagree:
 - occupancy counts the layer itself and those behind it, as in code and pseudocode; equation 2 has those in
   front;
 - `compositing="weighted"` (section 3.1) is not in the code. Read as sum_l L_l K_l / (sum_l w_l K_l + 1e-6);
-  equation 6 as printed weighs radiance, which holds its weights already, a second time: `"printed"`;
+  equation 6 as printed weighs radiance, which holds its weights already, a second time: `"printed"`, which
+  does not keep a constant image constant;
 - Optimized is not in the code either. Chosen here: the three shares of the levels are a softmax at every
   pixel, levels are enlarged bilinearly and halved by averaging 2x2, each has a kernel generator of its own.
 
 Ours: radiance is multiplied by `exposure` first and the result divided; depth is divided by the largest of
 the frame, motion by 128 pixels and the circle of confusion by 2, which gives the authors' numbers on their
 frames; what the networks see is clipped to +-1000; samples that are not finite are dropped; and images are
-padded with pixels without samples where the grid of the U-Net asks for it.
+padded with pixels without samples where the grid of the U-Net asks for it. Normals are taken as they come: in
+world space here, in the space of the view in the authors' data, which need networks of their own.
 
 Published, 8 spp, 36 test images (Tables 1 and 4; relMSE, SMAPE, SSIM, PSNR): PixelGather 0.0352, 0.0353,
 0.938, 33.706; SampleSplat 0.0298, 0.0344, 0.941, 33.878; Layer alpha 0.0288, 0.0350, 0.941, 33.838; weighted
@@ -42,20 +44,22 @@ configs/layers_sample.yaml.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from data.buffers import sample_channels
+from models.blocks.layered import Composite, Layered, Sorted, occupancy, smaller
 from models.blocks.per_sample import Frame, PerSample, Seen
 from models.blocks.pointwise import Pointwise
 from models.blocks.unet import UNet, Upsampling, enlarged
 from models.denoiser import Buffers, Denoised
+from models.ops.boxes import exporting
+from models.ops.outgoing import send
 from models.ops.precision import wide
-from models.ops.splat import gather_inside, source_maximum, splat_exp
-from models.ops.streaming import scattered, streamed
+from models.ops.splat import gather_inside, splat_apart, splat_exp
+from models.ops.streaming import scattered, streamed, strip_rows
 
 EPSILON = 1e-6
 """Added to sums of weights before something is divided by them."""
@@ -91,52 +95,13 @@ _PIXEL_ORDER = (
 SCALES = 3
 """Levels on which Optimized filters."""
 
+_TOGETHER = 4
+"""Samples per pixel of which kernels exist at once in SampleSplat's inference, where all are too many."""
+
 _NEVER = 1e30
 """Taken from logits of samples that do not count, so that they are no maximum."""
 
 Compositing = Literal["alpha", "weighted", "printed"]
-
-
-class Layered(NamedTuple):
-    """What becomes of the layers (figure 5 of the paper).
-
-    Attributes:
-        unfiltered: Radiance that was sorted into each layer, linear, (B, L, 3, H, W); their sum is the mean
-            of the samples.
-        filtered: Filtered radiance of each layer, weighted by alpha.
-        alpha: Opacity of each layer (B, L, 1, H, W); with weighted layers, its share of the weights.
-        color: The composite (B, 3, H, W).
-    """
-
-    unfiltered: Tensor
-    filtered: Tensor
-    alpha: Tensor
-    color: Tensor
-
-    def named(self) -> dict[str, Tensor]:
-        """Return `layer0_unfiltered`, `layer0_alpha`, `layer0_filtered`, `layer1_unfiltered` …, from front to
-        back, (B, 3 or 1, H, W)."""
-        made = {}
-        for layer in range(self.alpha.shape[1]):
-            for what in ("unfiltered", "alpha", "filtered"):
-                made[f"layer{layer}_{what}"] = getattr(self, what)[:, layer]
-        return made
-
-
-class Sorted(NamedTuple):
-    """What layers hold: radiance (B, L, 3, H, W), weight (B, L, 1, H, W), embedding (B, L, E, H, W)."""
-
-    radiance: Tensor
-    weight: Tensor
-    embedding: Tensor
-
-
-class Composite(NamedTuple):
-    """Filtered radiance and alpha of each layer, and the image; see `Layered`."""
-
-    filtered: Tensor
-    alpha: Tensor
-    color: Tensor
 
 
 class _Sampled(PerSample):
@@ -164,13 +129,14 @@ class _Sampled(PerSample):
     def _contexts(self, frame: Frame) -> list[Tensor]:
         """Return the stages of the U-Net, from fine to coarse, for the mean embedding of each pixel."""
 
-        def mean(samples: Tensor) -> Tensor:
-            seen = self._seen(samples, frame)
+        def mean(samples: Tensor, *of_frame: Tensor) -> Tensor:
+            seen = self._seen(samples, Frame(samples, *of_frame))
             total = (self._embedded(seen) * seen.counts).sum(1)
             return total / seen.counts.sum(1).clamp_min(1.0)
 
         numbers = self._images(frame) * (FEATURES + 3 * self.embedding)
-        return list(self.unet(streamed(mean, [frame.samples], numbers, self.recompute)))
+        image = streamed(mean, [frame.samples], numbers, self.recompute, frame.numbers)
+        return list(self.unet(self._padded(image)))
 
 
 class Layer(_Sampled):
@@ -216,8 +182,13 @@ class Layer(_Sampled):
         if not 1 <= layers <= 5:
             raise ValueError(f"layers is {layers}; expected 1 to 5")
         self.layers, self.compositing = layers, compositing
+        self.bytes_per_pixel = max(self.bytes_per_pixel, self._bytes_of_layers())
         self.partitioner = Pointwise(embedding + self.context, 32, 16, layers, linear=True)
         self.generator = self._generator()
+
+    def _bytes_of_layers(self) -> int:
+        """Return the working memory per pixel of layers beside the context: held, joined and splatted."""
+        return 5 * (self.context + self.layers * (2 * self.embedding + 10))
 
     def _generator(self) -> nn.Module:
         hidden = 2 * self.width
@@ -249,10 +220,11 @@ class Layer(_Sampled):
         return Layered(radiance, filtered, made.alpha[..., :height, :width], color)
 
     def _sorted(self, frame: Frame, context: Tensor) -> Sorted:
-        """Sort the samples into layers."""
+        """Sort the samples into layers, which are padded to the grid of the U-Net."""
+        height, width = frame.samples.shape[-2:]
 
-        def shares(samples: Tensor, context: Tensor) -> Tensor:
-            seen = self._seen(samples, frame)
+        def shares(samples: Tensor, context: Tensor, *of_frame: Tensor) -> Tensor:
+            seen = self._seen(samples, Frame(samples, *of_frame))
             embedding = self._embedded(seen)
             share = torch.softmax(wide(self.partitioner.joint(embedding, context)), 2)
             share = share * (seen.counts / seen.counts.sum(1, keepdim=True).clamp_min(1.0))
@@ -263,7 +235,9 @@ class Layer(_Sampled):
             return made.reshape(made.shape[0], self.layers, -1, *made.shape[2:])
 
         numbers = self._images(frame) * (FEATURES + 3 * self.embedding + 48)
-        made = streamed(shares, [frame.samples, context], numbers, self.recompute)
+        context = context[..., :height, :width]
+        tensors = [frame.samples, context]
+        made = self._padded(streamed(shares, tensors, numbers, self.recompute, frame.numbers))
         return Sorted(*made.split([3, 1, self.embedding], 2))
 
     def _composited(self, layers: Sorted, contexts: list[Tensor]) -> Composite:
@@ -277,9 +251,7 @@ class Layer(_Sampled):
 
         def spread(embedding: Tensor, context: Tensor, values: Tensor) -> Tensor:
             logits = wide(generator.joint(embedding, context)[:, :, :taps])
-            shift = source_maximum(logits).expand(values[:, :, :1].shape)
-            each = [part.flatten(0, 1)[:, None] for part in (values, logits, shift)]
-            return _rows(each[0], each[1], each[2], radius).reshape(*values.shape[:3], -1, values.shape[-1])
+            return splat_apart(values, logits, self.kernel_size, beyond=True)
 
         numbers = values.shape[0] * values.shape[1] * (taps + self.context)
         tensors = [layers.embedding, context, values]
@@ -338,6 +310,9 @@ class Optimized(Layer):
         reach = kernel_size // 2 + 1
         self.halo = self.unet.halo([reach * 2 ** (SCALES - 1), *[reach] * (SCALES - 1)])
 
+    def _numbers_of_unet(self) -> int:
+        return 4 * self.width + 2 * self.embedding
+
     def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
         w = self.width
         if self.narrow_context:
@@ -361,7 +336,7 @@ class Optimized(Layer):
         color, finest = torch.zeros_like(layers.radiance[:, 0]), None
         for level, generator in enumerate(self.generator):
             assert isinstance(generator, Pointwise)
-            made = self._filtered(_smaller(layers, 2**level), contexts[level], generator)
+            made = self._filtered(smaller(layers, 2**level), contexts[level], generator)
             finest = made if finest is None else finest
             image = enlarged(made.color, 2**level, "bilinear") if level else made.color
             color = color + image * shares[:, level : level + 1]
@@ -407,19 +382,36 @@ class SampleSplat(_Sampled):
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Layer.forward`."""
         frame = self._frame(buffers)
-        context = self._contexts(frame)[0]
-        taps, radius = self.kernel_size**2, self.kernel_size // 2
+        height, width = frame.samples.shape[-2:]
+        sums = self._arrived(frame, self._contexts(frame)[0][..., :height, :width])
+        return Denoised(self._cropped(sums[:, :3] / (sums[:, 3:] + EPSILON), buffers))
 
-        def spread(samples: Tensor, context: Tensor) -> Tensor:
-            seen = self._seen(samples, frame)
+    def _arrived(self, frame: Frame, context: Tensor) -> Tensor:
+        """Return radiance and number of samples, weighted, that arrive at each pixel, (B, 4, H, W)."""
+        taps, size, batch = self.kernel_size**2, self.kernel_size, frame.samples.shape[0]
+
+        def kernels(samples: Tensor, context: Tensor, *of_frame: Tensor) -> tuple[Tensor, Tensor]:
+            seen = self._seen(samples, Frame(samples, *of_frame))
             logits = wide(self.generator.joint(self._embedded(seen), context))
             logits = logits + (seen.counts - 1) * _NEVER
-            values = torch.cat([seen.radiance, seen.counts], 2)
-            return _rows(values, logits, source_maximum(logits), radius)
+            return torch.cat([seen.radiance, seen.counts], 2), logits
 
-        numbers = self._images(frame) * (taps + self.context)
-        sums = scattered(spread, [frame.samples, context], radius, numbers, self.recompute)
-        return Denoised(self._cropped(sums[:, :3] / (sums[:, 3:] + EPSILON), buffers))
+        def together(samples: Tensor, context: Tensor, *of_frame: Tensor) -> Tensor:
+            values, logits = kernels(samples, context, *of_frame)
+            return splat_exp(values, logits, size, beyond=True).total
+
+        def apart(samples: Tensor, context: Tensor, *of_frame: Tensor) -> Tensor:
+            sums = None
+            for some in samples.split(_TOGETHER, 1):
+                sums = send(sums, *kernels(some, context, *of_frame))
+            assert sums is not None
+            return sums.arrived(size, beyond=True)
+
+        spread, numbers = together, self._images(frame) * (taps + self.context)
+        if not (exporting() or torch.is_grad_enabled()) and strip_rows(context, numbers) < size:
+            spread, numbers = apart, batch * (4 * taps + _TOGETHER * (taps + self.context))
+        tensors = [frame.samples, context]
+        return scattered(spread, tensors, size // 2, numbers, self.recompute, frame.numbers)
 
 
 class PixelGather(PerSample):
@@ -449,50 +441,31 @@ class PixelGather(PerSample):
         self.reducer = Pointwise(2 * FEATURES, *[embedding] * 3, linear=False)
         self.generator = Pointwise(embedding + self.context, hidden, hidden, kernel_size**2, linear=True)
         self.halo = max(self.unet.halo([0]), kernel_size // 2)
+        # All logits and what becomes of them at once: measured 7640 at 320x320 with 17x17 kernels.
+        self.exported_bytes_per_pixel = 28 * kernel_size**2
+        self.bytes_per_pixel = max(self.bytes_per_pixel, 5 * (kernel_size**2 + 3 * embedding + self.context))
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Layer.forward`."""
         frame = self._frame(buffers)
 
-        def moments(samples: Tensor) -> Tensor:
-            seen = self._seen(samples, frame)
+        def moments(samples: Tensor, *of_frame: Tensor) -> Tensor:
+            seen = self._seen(samples, Frame(samples, *of_frame))
             count = seen.counts.sum(1).clamp_min(1.0)
             mean = seen.features.sum(1) / count
             spread = ((seen.features - mean[:, None]).square() * seen.counts).sum(1) / count
             return torch.cat([seen.radiance.sum(1) / count, seen.counts.amax(1), mean, spread], 1)
 
         numbers = self._images(frame) * 3 * FEATURES
-        image, counts, features = streamed(moments, [frame.samples], numbers, self.recompute).split(
-            [3, 1, 2 * FEATURES], 1
-        )
+        made = self._padded(streamed(moments, [frame.samples], numbers, self.recompute, frame.numbers))
+        image, counts, features = made.split([3, 1, 2 * FEATURES], 1)
         embedding = wide(self.reducer(features))
         context = self.unet(embedding)[0]
-        logits = wide(self.generator.joint(embedding[:, None], context))[:, 0]
+
+        def kernels(embedding: Tensor, context: Tensor) -> Tensor:
+            return wide(self.generator.joint(embedding[:, None], context))[:, 0]
+
+        numbers = image.shape[0] * (self.kernel_size**2 + self.context)
+        logits = streamed(kernels, [embedding, context], numbers, self.recompute)
         sums = gather_inside(torch.cat([image, counts], 1), logits, self.kernel_size)
         return Denoised(self._cropped(sums[:, :3] / sums[:, 3:].clamp_min(1e-20), buffers))
-
-
-def occupancy(weight: Tensor) -> Tensor:
-    """Return the weights of each layer and those behind it, summed: (B, L, 1, H, W) of the same."""
-    last, *front = weight.unbind(1)[::-1]
-    behind = [last]
-    for layer in front:
-        behind.append(behind[-1] + layer)
-    return torch.stack(behind[::-1], 1)
-
-
-def _rows(values: Tensor, logits: Tensor, shift: Tensor, radius: int) -> Tensor:
-    """Splat (N, M, V, h, W) and return what arrives, summed over M, with the rows above and below that are
-    reached: (N, V, h + 2 radius, W)."""
-    margin = (0, 0, radius, radius)
-    padded = (F.pad(part, margin) for part in (values, logits, shift))
-    values, logits, shift = padded
-    return splat_exp(values, logits, 2 * radius + 1, shift).total
-
-
-def _smaller(layers: Sorted, factor: int) -> Sorted:
-    """Return layers of which factor x factor pixels are averaged."""
-    if factor == 1:
-        return layers
-    made = (F.avg_pool2d(part.flatten(0, 1), factor) for part in layers)
-    return Sorted(*(m.reshape(*p.shape[:2], *m.shape[1:]) for m, p in zip(made, layers, strict=True)))

@@ -13,13 +13,16 @@ Follows the authors' code. Ours, and what an option restores:
 - features: all 93 of the code (path depth 6; the layer embedding paper counts 74) and 3 of the camera are the
   default. `features` chooses groups (`GROUPS`) or single quantities, so that frames which hold less can be
   used; light that is not split is `radiance`, where diffuse and specular are `light`. The camera's numbers
-  come from `thin_lens` (B, 3), aperture radius, focus distance and field of view, and are 0 without it;
+  are the frame number `thin_lens`, and 0 without it. Frames of `trainer render samples` have radiance, lens,
+  time, normal, depth, diffuse albedo (and specular albedo and roughness, which SBMC does not read) and the
+  camera; what only the authors' renderer writes, and the layout `sbmc` reads, are both hits apart, light that
+  is split, visibility, and the paths: probabilities, light directions and kinds of bounces;
 - border: the code lets offsets from outside the image take weight, as black, and then cuts off the outer 10
   pixels. Here they are left out: the same pixels inside, and bright ones at the border. `outside="weigh"` is
   the code's. Training compares without these pixels (`crop`);
-- depth is divided by the largest of the frame (`depth="raw"`: as it is; the authors' data are divided by ten
-  scene radii), radiance is multiplied by `exposure` and the result divided, features are clipped to +-1000,
-  and samples that are not finite are dropped;
+- depth, aperture and focus distance are divided by the largest depth of the frame (`depth="raw"`: as they
+  are; the authors' data are divided by ten scene radii), radiance is multiplied by `exposure` and the result
+  divided, features are clipped to +-1000, and samples that are not finite are dropped;
 - `filter="gather"` and `average=True`, a network that sees pixels instead of samples, are the ablations.
 
 Memory does not grow with the number of samples: whatever belongs to a sample is computed from its features
@@ -40,20 +43,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from data.buffers import SAMPLES, sample_channels
+from data.buffers import SAMPLES, THIN_LENS, sample_channels
 from models.blocks.multisteps import Chain, Context, NormalisedConv
 from models.blocks.sbmc_features import FEATURE_LIMIT, GROUPS, Seen, averaged, expanded, seen_samples
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.arrivals import Arrivals, Outside, gathered, merge, splatted, together, with_outside
 from models.ops.boxes import exporting
 from models.ops.gather import pad_border
-from models.ops.guides import depth_range, farthest, finite
+from models.ops.guides import farthest, finite
+from models.ops.loops import overlapped
+from models.ops.per_sample import sample_depths
 from models.ops.precision import wide
 from models.ops.streaming import streamed
 from models.ops.tonemap import exposed
-
-CAMERA = "thin_lens"
-"""Frame number (B, 3): aperture radius, focus distance, field of view."""
 
 _NEVER = 1e4
 """Taken from logits of samples that do not count."""
@@ -70,6 +72,17 @@ class Frame(NamedTuple):
     farthest: Tensor
     camera: Tensor | None
 
+    @property
+    def numbers(self) -> tuple[Tensor, ...]:
+        """What belongs to the frame and not to a pixel."""
+        return (self.exposure, self.farthest, *([] if self.camera is None else [self.camera]))
+
+    def rows(self, samples: Tensor, others: Sequence[Tensor]) -> tuple[Frame, Sequence[Tensor]]:
+        """Return the frame of some rows, and their contexts: `others` without `numbers`, which come last."""
+        split = len(others) - len(self.numbers)
+        exposure, largest, *camera = others[split:]
+        return Frame(samples, exposure, largest, camera[0] if camera else None), others[:split]
+
 
 class SBMC(Denoiser):
     """Sample-based denoiser of Gharbi et al. 2019.
@@ -77,7 +90,7 @@ class SBMC(Denoiser):
     Args:
         features: Groups (keys of `GROUPS`) and quantities (`data.buffers.SAMPLE_BUFFERS`) that are read;
             among them `light` or `radiance`.
-        camera: Also read aperture radius, focus distance and field of view.
+        camera: Also read aperture radius, focus distance and field of view (`thin_lens`).
         rounds: Rounds of embedding and context.
         width: Channels of embeddings and contexts; the U-Nets double it on every level.
         levels: Resolutions of the U-Nets.
@@ -87,7 +100,7 @@ class SBMC(Denoiser):
         outside: In splats, offsets from outside the image are left out (`drop`) or take weight, as black
             (`weigh`); in gathers they always do.
         crop: Training leaves out the pixels that a kernel reaches from the border.
-        depth: `relative` to the largest of the frame, or `raw`.
+        depth: Distances are `relative` to the largest of the frame, or `raw`.
         recompute: In training, compute what belongs to single samples again in the backward pass.
         fill: Quantity → the constant that stands for it where samples lack it.
 
@@ -96,7 +109,6 @@ class SBMC(Denoiser):
     """
 
     inputs = (SAMPLES,)
-    frame_numbers = ("exposure", "depth_range")
     per_sample = True
     bytes_per_pixel = 12000
 
@@ -128,6 +140,7 @@ class SBMC(Denoiser):
         self.kernel_size, self.filter, self.average = kernel_size, filter, average
         self.outside, self.crop, self.depth, self.recompute = outside, crop, depth, recompute
         self.camera, self.width, self.multiple = camera, width, 2 ** (levels - 1)
+        self.frame_numbers = ("exposure", "depth_range", *([THIN_LENS] if camera else []))
         channels = len(sample_channels(*self.samples)) + (3 if camera else 0)
         self.embeddings = nn.ModuleList(
             Chain(before, width, width, width, slope=0.0)
@@ -172,8 +185,7 @@ class SBMC(Denoiser):
         """Return `depth_range` (B, 2) of whole frames, where depth is read."""
         if "depth" not in self.samples:
             return {}
-        place = sample_channels(*self.samples).index("depth.Z")
-        return {"depth_range": depth_range(buffers[SAMPLES][:, :, place])}
+        return {"depth_range": sample_depths(buffers[SAMPLES], self.samples)}
 
     def deploy(self) -> Denoiser:
         """Return a copy with plain convolutions: weights are normalised once."""
@@ -198,10 +210,16 @@ class SBMC(Denoiser):
             largest = farthest(like, given)
         camera = None
         if self.camera:
-            given_camera = buffers.get(CAMERA)
-            camera = like.new_zeros(like.shape[0], 3) if given_camera is None else finite(given_camera)
-            camera = camera.clamp(-FEATURE_LIMIT, FEATURE_LIMIT)[:, :, None, None]
+            camera = self._camera(like, largest, buffers.get(THIN_LENS))
         return Frame(samples, wide(self.exposure(buffers)), largest, camera)
+
+    def _camera(self, like: Tensor, largest: Tensor, given: Tensor | None) -> Tensor:
+        """Return aperture, focus distance and field of view as the network sees them, (B, 3, 1, 1)."""
+        if given is None:
+            return like.new_zeros(like.shape[0], 3, 1, 1)
+        numbers = finite(given).to(like.dtype)[:, :, None, None].expand(like.shape[0], -1, -1, -1)
+        distances = numbers[:, :2] / largest
+        return torch.cat((distances, numbers[:, 2:]), 1).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
 
     def _seen(self, samples: Tensor, frame: Frame) -> Seen:
         """Return samples of some rows as the network sees them, one per pixel where they are averaged."""
@@ -219,15 +237,17 @@ class SBMC(Denoiser):
     def _contexts(self, frame: Frame) -> list[Tensor]:
         contexts: list[Tensor] = []
 
-        def mean(samples: Tensor, *contexts: Tensor) -> Tensor:
-            seen = self._seen(samples, frame)
-            total = (wide(self._embedded(seen, frame, contexts)) * seen.counts).sum(1)
+        def mean(samples: Tensor, *others: Tensor) -> Tensor:
+            rows, contexts = frame.rows(samples, others)
+            seen = self._seen(samples, rows)
+            total = (wide(self._embedded(seen, rows, contexts)) * seen.counts).sum(1)
             return total / seen.counts.sum(1).clamp_min(1.0)
 
         batch, count = frame.samples.shape[:2]
         for step, unet in enumerate(self.unets):
             numbers = batch * count * (frame.samples.shape[2] + 2 * self.width * (step + 1))
-            contexts.append(unet(streamed(mean, [frame.samples, *contexts], numbers, self.recompute)))
+            tensors = [frame.samples, *contexts]
+            contexts.append(unet(streamed(mean, tensors, numbers, self.recompute, frame.numbers)))
         return contexts
 
     def _filtered(self, frame: Frame, buffers: Buffers) -> Tensor:
@@ -241,13 +261,20 @@ class SBMC(Denoiser):
     def _splatted(self, frame: Frame, contexts: list[Tensor]) -> Arrivals:
         reach, height = self.kernel_size // 2, frame.samples.shape[-2]
 
-        def spread(samples: Tensor, *contexts: Tensor) -> Tensor:
-            seen, logits = self._kernels(samples, frame, contexts)
+        def spread(samples: Tensor, *others: Tensor) -> Tensor:
+            rows, contexts = frame.rows(samples, others)
+            seen, logits = self._kernels(samples, rows, contexts)
             return torch.cat(splatted(seen.radiance, logits, self.kernel_size, beyond=True), 1)
 
         sums: Arrivals | None = None
-        for first, part in self._parts(spread, frame, contexts):
-            sums = _joined(sums, part, first, height + 2 * reach)
+        if torch.jit.is_tracing():
+            each = frame.samples.shape[1] if not self.average else 1
+            numbers = frame.samples.shape[0] * each * (3 * self.width + self.kernel_size**2)
+            tensors = [frame.samples, *contexts]
+            sums = _arrivals(overlapped(spread, tensors, frame.numbers, numbers, reach, _merged))
+        else:
+            for first, part in self._parts(spread, frame, contexts):
+                sums = _joined(sums, part, first, height + 2 * reach)
         assert sums is not None
         inside = Arrivals(*(image[..., reach : reach + height, :] for image in sums))
         if self.outside == "drop":
@@ -255,8 +282,9 @@ class SBMC(Denoiser):
         return with_outside(inside, self.kernel_size, 1 if self.average else frame.samples.shape[1])
 
     def _gathered(self, frame: Frame, contexts: list[Tensor]) -> Arrivals:
-        def choose(samples: Tensor, *contexts: Tensor) -> Tensor:
-            seen, logits = self._kernels(samples, frame, contexts)
+        def choose(samples: Tensor, *others: Tensor) -> Tensor:
+            rows, contexts = frame.rows(samples, others)
+            seen, logits = self._kernels(samples, rows, contexts)
             padded = pad_border(seen.radiance.flatten(0, 1), self.kernel_size // 2, "zero")
             parts = gathered(padded, logits.flatten(0, 1), self.kernel_size)
             apart = Arrivals(*(image.unflatten(0, seen.radiance.shape[:2]) for image in parts))
@@ -287,7 +315,7 @@ class SBMC(Denoiser):
         """
         samples = frame.samples
         if exporting():
-            yield 0, function(samples, *contexts)
+            yield 0, function(samples, *contexts, *frame.numbers)
             return
         batch, count, _, height, width = samples.shape
         each = count if self.average else 1
@@ -296,12 +324,21 @@ class SBMC(Denoiser):
         for first in range(0, height, rows):
             strip = [image[..., first : first + rows, :] for image in contexts]
             for n in range(0, count, each):
-                part = samples[:, n : n + each, :, first : first + rows]
+                every = (samples[:, n : n + each, :, first : first + rows], *strip, *frame.numbers)
                 if self.recompute and torch.is_grad_enabled():
-                    made = checkpoint(function, part, *strip, use_reentrant=False, preserve_rng_state=False)
+                    made = checkpoint(function, *every, use_reentrant=False, preserve_rng_state=False)
                 else:
-                    made = function(part, *strip)
+                    made = function(*every)
                 yield first, made
+
+
+def _arrivals(maps: Tensor) -> Arrivals:
+    return Arrivals(maps[:, :3], maps[:, 3:4], maps[:, 4:])
+
+
+def _merged(one: Tensor, other: Tensor) -> Tensor:
+    """Return the sums of both, (B, 5, h, W) each."""
+    return torch.cat(merge(_arrivals(one), _arrivals(other)), 1)
 
 
 def _joined(sums: Arrivals | None, part: Tensor, first: int, height: int) -> Arrivals:

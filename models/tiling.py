@@ -73,7 +73,9 @@ class Tile:
     read: tuple[slice, slice]
 
 
-def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int = 1) -> tuple[int, int]:
+def core_size(
+    denoiser: Tileable, size: tuple[int, int], budget: int, batch: int = 1, samples: int = 0
+) -> tuple[int, int]:
     """Return the rows and columns of the cores that fit into a memory budget and read the fewest pixels.
 
     Halos are read again by every tile, but not beyond the image, so long tiles along the shorter side often
@@ -84,11 +86,12 @@ def core_size(denoiser: Tileable, size: tuple[int, int], budget: int, batch: int
         size: Height and width of the image, multiples of `multiple`.
         budget: Working memory in bytes.
         batch: Images that are denoised at once; of sequences, all of their frames.
+        samples: Numbers per pixel of all samples, of which a tile holds a copy; 0: they are not read.
 
     Raises:
         ValueError: Not even the smallest tile fits; the message says how much is needed.
     """
-    per_pixel = int(getattr(denoiser, "bytes_per_pixel", BYTES_PER_PIXEL)) * batch
+    per_pixel = (int(getattr(denoiser, "bytes_per_pixel", BYTES_PER_PIXEL)) + 4 * samples) * batch
     once = int(getattr(denoiser, "bytes_once", 0))
     halo, multiple = aligned_halo(denoiser), denoiser.multiple
     (tall, wide), pixels = size, max(budget - once, 0) // per_pixel
@@ -181,19 +184,23 @@ def denoise_in_tiles(
     batch, height, width = _size(denoiser, buffers)
     numbers = numbers_of_frame(denoiser, buffers)
     multiple = denoiser.multiple
-    images = {name: _padded(name, buffers[name], multiple) for name in denoiser.inputs}
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
     call: Callable[[Mapping[str, Tensor]], Any] = denoiser
     if getattr(denoiser, "frames", 0):
         call = denoiser.clip  # type: ignore[attr-defined]  # declared by methods with `frames`
     if tile is None:
-        core = core_size(denoiser, (tall, wide), budget, batch)
+        held = buffers[SAMPLES].shape[1:3].numel() if SAMPLES in denoiser.inputs else 0
+        core = core_size(denoiser, (tall, wide), budget, batch, held)
     else:
         core = (_even(tall, max(tile, 1), multiple), _even(wide, max(tile, 1), multiple))
     whole = _Whole((tall, wide))
     for piece in tiles(tall, wide, core, aligned_halo(denoiser)):
         rows, columns = piece.read
-        part = {name: image[..., rows, columns].contiguous() for name, image in images.items()}
+        # Padded tile by tile, since a frame of many samples is large.
+        part = {
+            name: _padded(name, buffers[name][..., rows, columns], multiple).contiguous()
+            for name in denoiser.inputs
+        }
         with _steps(progress, pace, whole.done, _share(piece, (tall, wide))):
             result = call({**part, **numbers})
         whole.place(piece, result)

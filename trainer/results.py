@@ -107,6 +107,7 @@ def _letters(name: str, image: Image) -> str:
 
 def _pictures(result: Result, sheet: bool) -> dict[str, Picture]:
     from trainer.reports.attention import attention_picture
+    from trainer.reports.composite import is_layered
     from trainer.reports.layers import layer_sheet
     from trainer.reports.pictures import comparison, tone_map
 
@@ -120,5 +121,8 @@ def _pictures(result: Result, sheet: bool) -> dict[str, Picture]:
     if result.attention is not None:
         pictures["attention"] = attention_picture(color, exposure, result.attention, label)
     if sheet:
-        pictures["sheet"] = layer_sheet(color, exposure, result.aux, label)
+        if is_layered(result.aux):
+            pictures["sheet"] = layer_pictures(result)["layers"]
+        else:
+            pictures["sheet"] = layer_sheet(color, exposure, result.aux, label)
     return pictures

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from models.blocks.pointwise import mixed
 from models.ops.precision import wide
 
 SLOPE = 0.01
@@ -43,13 +44,14 @@ class Chain(nn.Module):
         assert isinstance(first, NormalisedConv)
         weight = first.kernel()
         if shared is None:
-            maps = F.conv2d(own.flatten(0, 1), weight, first.bias)
+            maps = mixed(own.flatten(0, 1), weight, first.bias)
         else:
-            common = F.conv2d(shared, weight[:, split:], first.bias)
-            maps = F.conv2d(own.flatten(0, 1), weight[:, :split])
+            common = mixed(shared, weight[:, split:], first.bias)
+            maps = mixed(own.flatten(0, 1), weight[:, :split])
             maps = (maps.reshape(batch, -1, *maps.shape[1:]) + common[:, None]).flatten(0, 1)
         for layer in rest:
-            maps = layer(F.leaky_relu(maps, self.slope))
+            assert isinstance(layer, NormalisedConv)
+            maps = mixed(F.leaky_relu(maps, self.slope), layer.kernel(), layer.bias)
         return maps.reshape(batch, -1, *maps.shape[1:])
 
 

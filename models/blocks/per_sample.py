@@ -9,12 +9,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from data.buffers import SAMPLE_BUFFERS, SAMPLES, sample_channels
+from data.buffers import SAMPLE_BUFFERS, SAMPLES
 from models.blocks.unet import UNet, Upsampling
 from models.denoiser import Buffers, Denoiser
 from models.ops.boxes import exporting
-from models.ops.guides import depth_range, farthest, finite
-from models.ops.per_sample import whole
+from models.ops.guides import farthest
+from models.ops.per_sample import known, sample_depths
+from models.ops.precision import wide
 from models.ops.tonemap import exposed, srgb_log
 
 RADIANCE_LIMIT = 65535.0
@@ -54,11 +55,16 @@ class Seen(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A batch, padded to the grid of the U-Net: samples, exposure and largest depth (B, 1, 1, 1)."""
+    """A batch: samples (B, S, 20, H, W), exposure and largest depth (B, 1, 1, 1)."""
 
     samples: Tensor
     exposure: Tensor
     farthest: Tensor
+
+    @property
+    def numbers(self) -> tuple[Tensor, ...]:
+        """What belongs to the frame and not to a pixel: for some rows, `Frame(rows, *numbers)`."""
+        return (self.exposure, self.farthest)
 
 
 class PerSample(Denoiser):
@@ -85,7 +91,7 @@ class PerSample(Denoiser):
     frame_numbers = ("exposure", "depth_range")
     per_sample = True
     samples = _READ  # as files and shards hold them, so that batches need not be copied
-    bytes_per_pixel = 4000
+    bytes_once = 1 << 26  # strips of `models.ops.streaming`
     order = _READ
 
     def __init__(
@@ -114,33 +120,34 @@ class PerSample(Denoiser):
         self.multiple = 2**levels
         self.context = 2 * width
         self.unet = self._unet(levels, upsampling)
+        self.bytes_per_pixel = 5 * self._numbers_of_unet()
 
     def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
         w = self.width
         encoder, decoder = (2 * w, 4 * w, 8 * w, 8 * w), (8 * w, 4 * w, 2 * w, 2 * w, 2 * w)
         return UNet(self.embedding, w, encoder[: levels - 1], decoder[-levels:], self.context, upsampling)
 
+    def _numbers_of_unet(self) -> int:
+        """Return the numbers per pixel that are alive at full resolution, at most: bytes are 5 times as many
+        with what convolutions take for themselves."""
+        return 7 * self.width + 2 * self.embedding
+
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of the samples of whole frames."""
-        place = sample_channels(*_READ).index("depth.Z")
-        return {"depth_range": depth_range(buffers[SAMPLES][:, :, place])}
+        return {"depth_range": sample_depths(buffers[SAMPLES], _READ)}
 
     def _frame(self, buffers: Buffers) -> Frame:
-        _, height, width = self.check(buffers)
+        self.check(buffers)
         samples = buffers[SAMPLES]
-        bottom, right = -height % self.multiple, -width % self.multiple
-        if exporting() or bottom or right:  # no number: pixels without samples
-            samples = F.pad(samples, (0, right, 0, bottom), value=torch.nan)
         depths = buffers["depth_range"] if "depth_range" in buffers else self.measure(buffers)["depth_range"]
         return Frame(samples, self.exposure(buffers), farthest(samples[:, 0, :1], depths))
 
     def _seen(self, samples: Tensor, frame: Frame) -> Seen:
         """Return some rows of a frame's samples as networks see them."""
-        counts = whole(samples)
-        clean = finite(samples.where(counts, 0.0))
+        clean, counts = known(samples, _READ)
         parts: dict[str, Tensor] = {}
         for name, part in zip(
-            _READ, clean.split([len(SAMPLE_BUFFERS[n].letters) for n in _READ], 2), strict=True
+            _READ, wide(clean).split([len(SAMPLE_BUFFERS[n].letters) for n in _READ], 2), strict=True
         ):
             parts[name] = part * _SCALES[name] if name in _SCALES else part
         radiance = exposed(parts["radiance"], frame.exposure[:, None]).clamp_max(RADIANCE_LIMIT)
@@ -149,6 +156,14 @@ class PerSample(Denoiser):
         features = torch.cat([parts[name] for name in self.order], 2).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
         weight = counts.to(radiance.dtype)
         return Seen(radiance * weight, features * weight, weight)
+
+    def _padded(self, maps: Tensor) -> Tensor:
+        """Return maps (…, H, W) padded to the grid of the U-Net by zeros, as pixels without samples have."""
+        height, width = maps.shape[-2:]
+        bottom, right = -height % self.multiple, -width % self.multiple
+        if exporting() or bottom or right:
+            return F.pad(maps, (0, right, 0, bottom))
+        return maps
 
     def _images(self, frame: Frame) -> int:
         return frame.samples.shape[0] * frame.samples.shape[1]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from models.ops.boxes import exporting
 
 SLOPE = 0.01
 """Negative slope of the leaky ReLU of Munkberg and Hasselgren 2020."""
@@ -27,7 +30,7 @@ class Pointwise(nn.Module):
 
     def forward(self, maps: Tensor) -> Tensor:
         """Return (N, widths[-1], H, W) of (N, widths[0], H, W)."""
-        return self._rest(self.first(maps))
+        return self._rest(mixed(maps, self.first.weight, self.first.bias))
 
     def joint(self, own: Tensor, shared: Tensor) -> Tensor:
         """Return what comes of [own, shared] without joining them.
@@ -43,16 +46,33 @@ class Pointwise(nn.Module):
         """
         batch, _, split, height, width = own.shape
         weight = self.first.weight
-        common = F.conv2d(shared, weight[:, split:], self.first.bias)
-        maps = F.conv2d(own.reshape(-1, split, height, width), weight[:, :split])
+        common = mixed(shared, weight[:, split:], self.first.bias)
+        maps = mixed(own.reshape(-1, split, height, width), weight[:, :split])
         maps = maps.reshape(batch, -1, *common.shape[1:]) + common[:, None]
         maps = self._rest(maps.flatten(0, 1))
         return maps.reshape(batch, -1, *maps.shape[1:])
 
     def _rest(self, maps: Tensor) -> Tensor:
         for layer in self.others:
-            maps = layer(F.leaky_relu(maps, SLOPE))
-        return maps if self.linear else F.leaky_relu(maps, SLOPE)
+            assert isinstance(layer, nn.Conv2d)
+            maps = mixed(F.leaky_relu(maps, SLOPE, inplace=True), layer.weight, layer.bias)
+        return maps if self.linear else F.leaky_relu(maps, SLOPE, inplace=True)
+
+
+def mixed(maps: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Return the 1x1 convolution of maps (N, C, H, W) with weights (C', C, 1, 1), (N, C', H, W).
+
+    In inference on a CPU it is a product of matrices: for 2 to 32 channels that takes a half to an eighth of
+    the time. In training that is not faster.
+    """
+    if exporting() or torch.is_grad_enabled() or maps.device.type != "cpu":
+        return F.conv2d(maps, weight, bias)
+    matrices, columns = weight[None, :, :, 0, 0].expand(len(maps), -1, -1), maps.flatten(2)
+    if bias is None:
+        made = torch.bmm(matrices, columns)
+    else:
+        made = torch.baddbmm(bias[:, None], matrices, columns)
+    return made.unflatten(2, maps.shape[2:])
 
 
 def convolution(before: int, after: int, size: int) -> nn.Conv2d:

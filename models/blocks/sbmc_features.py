@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from data.buffers import SAMPLE_BUFFERS
-from models.ops.guides import finite
-from models.ops.per_sample import whole
+from models.ops.per_sample import known
+from models.ops.precision import wide
 from models.ops.tonemap import exposed
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -58,9 +58,10 @@ def seen_samples(samples: Tensor, names: Sequence[str], exposure: Tensor, farthe
         exposure: Factor of radiance, (B, 1, 1, 1) or (1, 1, 1, 1).
         farthest: Divisor of depths, likewise.
     """
-    counts = whole(samples)
-    clean = finite(samples.where(counts, 0.0))
-    parts = dict(zip(names, clean.split([len(SAMPLE_BUFFERS[n].letters) for n in names], 2), strict=True))
+    clean, counts = known(samples, names)
+    parts = dict(
+        zip(names, wide(clean).split([len(SAMPLE_BUFFERS[n].letters) for n in names], 2), strict=True)
+    )
     parts |= {n: exposed(parts[n], exposure[:, None]) for n in _LIGHT if n in parts}
     if "radiance" in parts:
         radiance = parts["radiance"]

@@ -73,16 +73,16 @@ class UNet(nn.Module):
         Returns:
             (B, outputs, H, W), then (B, decoder[-2], H / 2, W / 2), (B, decoder[-3], H / 4, W / 4) …
         """
-        maps, skips = F.leaky_relu(self.entry(image), SLOPE), [image]
+        maps, skips = F.leaky_relu(self.entry(image), SLOPE, inplace=True), [image]
         for layer in self.encoder:
-            maps = F.max_pool2d(F.leaky_relu(layer(maps), SLOPE), 2)
+            maps = F.max_pool2d(F.leaky_relu(layer(maps), SLOPE, inplace=True), 2)
             skips.append(maps)
         skips.pop()
-        maps = F.leaky_relu(self.bottleneck(maps), SLOPE)
+        maps = F.leaky_relu(self.bottleneck(maps), SLOPE, inplace=True)
         stages: list[Tensor] = []
         for join, refine in zip(self.join, self.refine, strict=True):
             maps = torch.cat([enlarged(maps, 2, self.upsampling), skips.pop()], 1)
-            maps = F.leaky_relu(refine(F.leaky_relu(join(maps), SLOPE)), SLOPE)
+            maps = F.leaky_relu(refine(F.leaky_relu(join(maps), SLOPE, inplace=True)), SLOPE, inplace=True)
             stages.append(maps)
         return [self.exit(stages.pop()), *stages[::-1]]
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops import kernel_graph as graph
@@ -85,8 +84,7 @@ def splatted(values: Tensor, logits: Tensor, size: int, beyond: bool = False) ->
         beyond: Return H + K - 1 rows: also those above and below the image that are reached.
     """
     if exporting():
-        outside = F.pad(logits, (0, 0, size // 2, size // 2), value=_NEVER) if beyond else logits
-        maximum = graph.arriving_maximum(wide(outside), size, _NEVER)
+        maximum = graph.arriving_maximum(wide(logits), size, _NEVER, beyond)
     else:
         maximum = wide(arriving_maximum(logits.detach(), size, beyond))
     return Arrivals(*splat_shifted(values, logits, size, maximum, beyond), maximum)

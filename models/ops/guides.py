@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from models.ops.boxes import exporting
 from models.ops.precision import wide
 
 ALBEDO_OFFSET = 0.00316
@@ -29,7 +30,10 @@ def unit_normal(normal: Tensor) -> Tensor:
 
 
 def depth_range(depth: Tensor) -> Tensor:
-    """Return the smallest and the largest depth (B, 2) of whole frames (B, 1, H, W); nothing is below 0."""
+    """Return the smallest and the largest depth (B, 2) of whole frames (B, N, H, W); nothing is below 0."""
+    if not exporting() and depth.shape[1] > 1:  # of many samples, one at a time
+        each = torch.stack([depth_range(part) for part in depth.split(1, 1)])
+        return torch.stack([each[..., 0].amin(0), each[..., 1].amax(0)], 1)
     clean = _distance(depth.detach())
     return torch.stack([clean.amin((1, 2, 3)), clean.amax((1, 2, 3))], 1)
 

@@ -1,16 +1,20 @@
 """Samples that are kept apart: which channels a network reads, and which samples count.
 
-A sample counts when all of its channels are finite; others are dropped, pixel by pixel. So a pixel may have
-fewer samples than the frame, or none.
+A sample counts when all of its channels are finite, except that distances may be infinite; others are
+dropped, pixel by pixel. So a pixel may have fewer samples than the frame, or none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
-from data.buffers import SAMPLE_BUFFERS, sample_channels
+from data.buffers import MAY_BE_INFINITE, SAMPLE_BUFFERS, sample_channels
+from models.ops.boxes import exporting
+from models.ops.guides import depth_range, finite
+from models.ops.loops import looped
 
 
 def arranged(
@@ -54,6 +58,59 @@ def arranged(
         else:
             result[:, :, place] = fill[channel.partition(".")[0]]
     return result
+
+
+def check_samples(samples: Tensor, channels: Sequence[str], reader: str) -> tuple[int, int]:
+    """Check the shape of samples and return (S, C).
+
+    Raises:
+        ValueError: It is not (B, S, C, H, W) with at least one sample and these channels.
+    """
+    shape = tuple(samples.shape)
+    if len(shape) != 5 or shape[1] == 0 or shape[2] != len(channels):
+        raise ValueError(
+            f"{reader}: buffer 'samples' has shape {shape}, expected (B, S, {len(channels)}, H, W) with at "
+            f"least one sample and the channels {', '.join(channels)}"
+        )
+    return shape[1], shape[2]
+
+
+def known(samples: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Return samples with 0 for all that is not finite, and which of them count, bool (B, S, 1, H, W).
+
+    Infinite distances are 0 as well, and the sample counts: the ray left the scene.
+
+    Args:
+        samples: (B, S, C, H, W), raw.
+        names: What the C channels are: quantities in order.
+    """
+    far = [channel.partition(".")[0] in MAY_BE_INFINITE for channel in sample_channels(*names)]
+    if any(far):
+        mask = torch.tensor(far, device=samples.device).reshape(-1, 1, 1)
+        samples = samples.where(~(mask & samples.isinf()), 0.0)
+    counts = whole(samples)
+    return samples.where(counts, 0.0), counts
+
+
+def sample_depths(samples: Tensor, names: Sequence[str]) -> Tensor:
+    """Return the smallest and the largest depth (B, 2) of the samples of whole frames that count.
+
+    Args:
+        samples: (B, S, C, H, W), raw.
+        names: What the C channels are; `depth` is among them.
+    """
+    place = sample_channels(*names).index("depth.Z")
+    if not torch.jit.is_tracing():
+        parts = [samples] if exporting() else samples.split(1, 1)  # one sample at a time
+        each = torch.stack([depth_range(known(part, names)[0][:, :, place]) for part in parts])
+        return torch.stack([each[..., 0].amin(0), each[..., 1].amax(0)], 1)
+
+    def bounds(samples: Tensor) -> Tensor:
+        depths = finite(known(samples, names)[0][:, :, place]).clamp_min(0.0)
+        return torch.stack([depths.amin(1), depths.amax(1)], 1)
+
+    made = looped(bounds, [samples], [], samples.shape[0] * samples.shape[1] * samples.shape[2])
+    return torch.stack([made[:, 0].amin((1, 2)), made[:, 1].amax((1, 2))], 1)
 
 
 def whole(samples: Tensor) -> Tensor:

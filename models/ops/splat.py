@@ -82,6 +82,36 @@ def splat_exp(
     return _splatted(values, logits, _Shifts(shift), size, beyond)
 
 
+def splat_apart(values: Tensor, logits: Tensor, size: int, beyond: bool = False) -> Tensor:
+    """Splat layers with weights exp(logit - shift), each into an image of its own.
+
+    The shift is the largest logit of the pixel that splats over all taps and all layers, as in `splat_exp`.
+
+    Args:
+        values: (B, N, C, H, W), of N layers.
+        logits: (B, N, K * K, H, W), in the order of `splat`.
+        size: K, odd.
+        beyond: As in `splat`.
+
+    Returns:
+        Weighted values, (B, N, C, H or H + K - 1, W).
+
+    Raises:
+        ValueError: As for `splat`.
+    """
+    if exporting():
+        largest = _Shifts(source_maximum(logits))
+    else:
+        _check(values, logits, size)
+        largest = _largest(logits.detach(), size)
+    assert largest.source is not None
+    source = largest.source.expand(values[:, :, :1].shape)
+    each = (part.flatten(0, 1)[:, None] for part in (values, logits, source))
+    values_of, logits_of, source_of = each
+    made = _splatted(values_of, logits_of, largest._replace(source=source_of), size, beyond).total
+    return made.reshape(*values.shape[:3], *made.shape[-2:])
+
+
 def splat_shifted(values: Tensor, logits: Tensor, size: int, shift: Tensor, beyond: bool = False) -> Splatted:
     """Splat values with weights exp(logit - shift), the shift being that of the pixel that is reached.
 
@@ -165,7 +195,7 @@ def _inside_maximum(logits: Tensor, size: int, dtype: torch.dtype) -> Tensor:
 
 class _Shifts(NamedTuple):
     """What is subtracted from logits: at the pixel that splats, with its place among the N * K * K logits
-    where it is one of them, and at the pixel that is reached."""
+    of each batch element where it is one of them, and at the pixel that is reached."""
 
     source: Tensor | None = None
     place: Tensor | None = None
@@ -182,10 +212,8 @@ def _splatted(values: Tensor, numbers: Tensor, shifts: _Shifts, size: int, beyon
     if target is not None:
         target = target.to(values.dtype)
     if exporting():
-        if beyond:
-            shifted = source is not None or target is not None
-            values, numbers, source = graph.extended(values, numbers, source, size, shifted)
-        sums = graph.scatter(values, graph.weights(numbers.to(values.dtype), size, source, target), size)
+        kernels = graph.weights(numbers.to(values.dtype), size, source, target, beyond)
+        sums = graph.scatter(values, kernels, size, beyond)
     elif torch.is_grad_enabled() and any(
         t is not None and t.requires_grad for t in (values, numbers, source)
     ):
@@ -267,7 +295,8 @@ class _Splat(torch.autograd.Function):
         d_values, d_numbers, d_source = slopes(kernels, values, gradient[:, None], wanted)
         if index is not None and d_numbers is not None and d_source is not None:
             # The shift is one of the logits: its gradient goes there.
-            change = d_source.sum(1).to(d_numbers.dtype)
+            change = d_source.reshape(len(index), -1, *index.shape[2:]).sum(1, keepdim=True)
+            change = change.to(d_numbers.dtype)
             d_numbers.view(len(change), -1, *change.shape[-2:]).scatter_add_(1, index, change)
         return d_values, d_numbers, d_source if for_source else None, None, None, None, None
 

@@ -16,6 +16,8 @@ from models.denoiser import Denoiser, select
 from models.tiling import denoise_tiled
 from tests.models.frames import largest_relative, lit, luminous, sampled, split_buffers
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
@@ -337,7 +339,7 @@ def test_a_traced_module_runs_at_another_size(denoiser: Denoiser) -> None:
     class Positional(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.inner = denoiser.deploy()
+            self.inner = denoiser.deploy().requires_grad_(False)  # parameters are constants of loops
 
         def forward(self, *tensors: Tensor) -> Tensor:
             color: Tensor = self.inner(dict(zip(names, tensors, strict=True))).color

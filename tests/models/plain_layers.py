@@ -39,13 +39,20 @@ def tone(radiance: Tensor) -> Tensor:
     return torch.tensor(values, dtype=torch.float64).reshape(radiance.shape)
 
 
+def clipped(samples: Tensor) -> Tensor:
+    """Samples with radiance in [0, 65535]."""
+    made = samples.clone()
+    made[:, RADIANCE] = samples[:, RADIANCE].clamp(0, 65535)
+    return made
+
+
 def features(samples: Tensor, order: Sequence[slice], farthest: float) -> Tensor:
     made = samples.clone()
     made[:, RADIANCE] = tone(samples[:, RADIANCE])
     made[:, DEPTH] = samples[:, DEPTH] / farthest
     made[:, 14:16] = samples[:, 14:16] / 128
     made[:, 16] = samples[:, 16] / 2
-    return torch.cat([made[:, part] for part in order], 1)
+    return torch.cat([made[:, part] for part in order], 1).clamp(-1000, 1000)
 
 
 def lrelu(maps: Tensor) -> Tensor:
@@ -120,7 +127,7 @@ def partition(
     state: State, samples: Tensor, farthest: float, mode: str
 ) -> tuple[list[tuple[Tensor, Tensor, Tensor]], list[Tensor]]:
     """Radiance, weight and embedding of every layer, and the context."""
-    spp = len(samples)
+    samples, spp = clipped(samples), len(samples)
     embeddings = [dense(state, "reducer", f, linear=False) for f in features(samples, LAYER, farthest)]
     contexts = unet(state, sum(embeddings) / spp, mode)  # type: ignore[arg-type]
     count = len(state["partitioner.others.1.bias"])
@@ -154,7 +161,7 @@ def composite(
             occupied = torch.stack([w for _, w, _ in held[j:]]).sum(0)
             n = splat(occupied[None], kernels[j], size) + EPSILON
             out += through * splat(radiance[None], kernels[j], size) / n
-            through *= 1 - splat(weight[None], kernels[j], size) / n
+            through = through * (1 - splat(weight[None], kernels[j], size) / n)
         return out
     numerator, denominator = torch.zeros_like(held[0][0]), torch.zeros_like(held[0][1])
     for (radiance, weight, _), kernel in zip(held, kernels, strict=True):
@@ -180,6 +187,7 @@ def optimized(state: State, samples: Tensor, size: int, farthest: float) -> Tens
 
 
 def sample_splat(state: State, samples: Tensor, size: int, farthest: float) -> Tensor:
+    samples = clipped(samples)
     embeddings = [dense(state, "reducer", f, linear=False) for f in features(samples, OTHERS, farthest)]
     context = unet(state, sum(embeddings) / len(samples))[0]  # type: ignore[arg-type]
     logits = torch.stack([dense(state, "generator", torch.cat([e, context]), True) for e in embeddings])
@@ -190,21 +198,23 @@ def sample_splat(state: State, samples: Tensor, size: int, farthest: float) -> T
 
 
 def pixel_gather(state: State, samples: Tensor, size: int, farthest: float) -> Tensor:
+    samples = clipped(samples)
     seen = features(samples, OTHERS, farthest)
     mean = sum(seen) / len(seen)
     variance = sum((f - mean) ** 2 for f in seen) / len(seen)
     embedding = dense(state, "reducer", torch.cat([mean, variance]), linear=False)  # type: ignore[list-item]
     context = unet(state, embedding)[0]
-    kernels = dense(state, "generator", torch.cat([embedding, context]), True).exp()
+    logits = dense(state, "generator", torch.cat([embedding, context]), True)
+    kernels = (logits - logits.amax(0)).exp()
     image = samples[:, RADIANCE].mean(0)
     out, (_, height, width), reach = torch.zeros_like(image), image.shape, size // 2
     for y in range(height):
         for x in range(width):
-            total = 0.0
+            total, colour = torch.zeros((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
             for tap in range(size * size):
                 row, column = y + tap // size - reach, x + tap % size - reach
                 if 0 <= row < height and 0 <= column < width:
-                    out[:, y, x] += kernels[tap, y, x] * image[:, row, column]
-                    total += float(kernels[tap, y, x])
-            out[:, y, x] /= total
+                    colour = colour + kernels[tap, y, x] * image[:, row, column]
+                    total = total + kernels[tap, y, x]
+            out[:, y, x] = colour / total
     return out

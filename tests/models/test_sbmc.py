@@ -12,10 +12,13 @@ from data.buffers import sample_channels
 from models import sbmc as module
 from models.blocks.multisteps import Context, NormalisedConv
 from models.blocks.sbmc_features import GROUPS, expanded
+from models.denoiser import select
 from models.ops import streaming
 from models.sbmc import SBMC
-from tests.benchmarks.memory import peak_bytes
+from tests.benchmarks.memory import live_bytes
 from tests.models.plain_sbmc import plain_sbmc
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 NARROW: dict[str, Any] = {"width": 4, "kernel_size": 5, "rounds": 2, "levels": 2}
 RENDERED = ("radiance", "normal", "depth", "diffuse_albedo", "lens", "time")
@@ -120,8 +123,8 @@ def test_strips_and_the_order_of_samples_change_nothing(
     made.recompute = False
     expected = gradients(values)
     made.recompute = True
-    monkeypatch.setattr(module, "_ROWS", 1 << 11)
-    monkeypatch.setattr(streaming, "_CHUNK", 1 << 12)
+    monkeypatch.setattr(module, "_ROWS", 1 << 12)
+    monkeypatch.setattr(streaming, "_CHUNK", 1 << 14)
     found = gradients(values.flip(1))
     torch.testing.assert_close(found[0], expected[0])
     for one, other in zip(found[1], expected[1], strict=True):
@@ -154,9 +157,9 @@ def test_memory_does_not_grow_with_samples(monkeypatch: pytest.MonkeyPatch) -> N
 
     few, many = (samples(made, count, 32, 32).float() for count in (2, 6))
     kernels = 4 * 9 * 9 * 32 * 32  # of one sample
-    assert peak_bytes(lambda: step(many)) - peak_bytes(lambda: step(few)) < 2 * kernels + 4 * many.numel()
+    assert live_bytes(lambda: step(many)) - live_bytes(lambda: step(few)) < 2 * kernels + 4 * many.numel()
     with torch.no_grad():
-        difference = peak_bytes(lambda: made({"samples": many})) - peak_bytes(lambda: made({"samples": few}))
+        difference = live_bytes(lambda: made({"samples": many})) - live_bytes(lambda: made({"samples": few}))
     assert difference < kernels + 4 * many.numel()
 
 
@@ -182,6 +185,26 @@ def test_the_camera_counts_where_it_is_given() -> None:
         lens = made({**buffers, "thin_lens": torch.tensor([[0.5, 2.0, 0.9]])}).color
     assert torch.equal(plain, zero)
     assert (lens - plain).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize(("depth", "equal"), [("relative", True), ("raw", False)])
+def test_distances_in_other_units_make_no_difference_where_they_are_relative(depth: str, equal: bool) -> None:
+    made = network(features=RENDERED, depth=depth)
+    values = samples(made).float()
+    scaled = values.clone()
+    scaled[:, :, sample_channels(*made.samples).index("depth.Z")] *= 10
+    lens = torch.tensor([[0.5, 2.0, 45.0]])
+    with torch.no_grad():
+        one = made({"samples": values, "thin_lens": lens}).color
+        other = made({"samples": scaled, "thin_lens": lens * torch.tensor([10.0, 10.0, 1.0])}).color
+    assert bool((one - other).abs().max() < 1e-5) is equal
+
+
+def test_batches_and_frames_bring_the_camera_to_networks_that_read_it() -> None:
+    made, blind = network(features=RENDERED), network(features=RENDERED, camera=False)
+    batch = {"samples": samples(made).float(), "thin_lens": torch.ones(1, 3)}
+    assert set(select(made, batch)) == {"samples", "thin_lens"}
+    assert set(select(blind, batch)) == {"samples"}
 
 
 @pytest.mark.parametrize(

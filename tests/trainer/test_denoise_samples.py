@@ -13,10 +13,10 @@ from PIL import Image
 
 import trainer.loading
 from data.exr import read_frame
-from data.exr_image import read_exr
+from data.exr_image import read_exr, write_exr
 from data.frame import Frame, Samples
 from data.root import resolve_root
-from models import Layer, PixelGather
+from models import NLM, Layer, PixelGather
 from models.denoiser import select
 from models.ops.per_sample import sample_counts
 from models.tiling import denoise_in_tiles
@@ -24,7 +24,7 @@ from trainer.commands import denoise as command
 from trainer.configs import UsageError
 from trainer.export.description import Source
 from trainer.loading import Loaded
-from trainer.samples import dropped, sample_tensor
+from trainer.samples import dropped, fill, sample_tensor
 
 SMALL: dict[str, Any] = {"width": 4, "levels": 2, "kernel_size": 3, "embedding": 6}
 FRAME = resolve_root("sample:layers").path / "indoor-000104" / "f000.exr"
@@ -39,14 +39,16 @@ def small(kind: type = Layer, **arguments: Any) -> Any:
     return model
 
 
-def denoise(monkeypatch: pytest.MonkeyPatch, model: Any, output: Path, *options: str) -> int:
+def denoise(
+    monkeypatch: pytest.MonkeyPatch, model: Any, output: Path, *options: str, frame: Path = FRAME
+) -> int:
     def resolve(*_: object, aux: bool, **__: object) -> Loaded:
         return Loaded(model, Source("small"))
 
     monkeypatch.setattr(trainer.loading, "resolve", resolve)
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)
-    arguments = [str(FRAME), "--model", "small", "--output", str(output), *options]
+    arguments = [str(frame), "--model", "small", "--output", str(output), *options]
     return command.run(parser.parse_args(arguments))
 
 
@@ -139,7 +141,72 @@ def test_dropped_samples_and_pixels_without_any_are_counted() -> None:
     assert dropped(samples) is None
     samples[0, :, 4, 1, 2], samples[0, 1, 0, 3, 3] = torch.nan, torch.inf
     assert sample_counts(samples)[0, 0].tolist()[1] == [3, 3, 0, 3]
-    assert dropped(samples) == (
+    lost = dropped(samples)
+    assert lost == (4, 2, 1)
+    assert lost is not None
+    assert lost.text() == (
         "4 samples with NaN or Inf in 2 pixels were dropped; "
-        "1 pixels had no other and were filled from around them"
+        "1 pixel had no other and was filled from around it"
     )
+
+
+def broken(path: Path) -> None:
+    """The frame with one sample, and all of another pixel, not finite."""
+    image = read_exr(FRAME)
+    image.channels["s03.radiance.G"][4, 5] = np.nan
+    for number in range(8):
+        image.channels[f"s{number:02d}.radiance.R"][9, 9] = np.inf
+    write_exr(path, image.channels, {k: v for k, v in image.attributes.items() if k.startswith("penumbra")})
+
+
+def test_dropped_samples_are_told_and_recorded_and_change_no_other_pixel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken(tmp_path / "f000.exr")
+    denoise(monkeypatch, small(PixelGather), tmp_path / "out", frame=tmp_path / "f000.exr")
+    assert (
+        "9 samples with NaN or Inf in 2 pixels were dropped; 1 pixel had no other" in capsys.readouterr().err
+    )
+    denoise(monkeypatch, small(PixelGather), tmp_path / "plain")
+    found, plain = (read_frame(tmp_path / name / "f000.exr") for name in ("out", "plain"))
+    assert found.notes["denoised"]["dropped"] == {"samples": 9, "pixels": 2, "empty": 1}
+    assert "dropped" not in plain.notes["denoised"]
+    np.testing.assert_array_equal(found.buffers["color"][40:], plain.buffers["color"][40:])
+
+
+def without_lens(path: Path) -> None:
+    """The frame without the channels of lens and time."""
+    image = read_exr(FRAME)
+    channels = {n: v for n, v in image.channels.items() if ".lens." not in n and ".time." not in n}
+    write_exr(path, channels, {k: v for k, v in image.attributes.items() if k.startswith("penumbra")})
+
+
+def test_a_lacking_guide_is_named_with_the_option_that_fills_it_and_that_fills_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = tmp_path / "f000.exr"
+    without_lens(frame)
+    with pytest.raises(ValueError, match=r"samples have no lens, time.*\(--fill lens=0 --fill time=0\)"):
+        denoise(monkeypatch, small(), tmp_path / "out", frame=frame)
+    denoise(monkeypatch, small(), tmp_path / "out", "--fill", "lens=0", "--fill", "time=0.5", frame=frame)
+    found = read_frame(tmp_path / "out" / "f000.exr")
+    assert found.notes["denoised"]["filled"] == {"lens": 0, "time": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("wind=0", "--fill wind=0: expected QUANTITY=VALUE with one of normal, depth"),
+        ("radiance=1", "--fill radiance=1: expected QUANTITY=VALUE"),
+        ("lens", "no finite number"),
+        ("lens=inf", "no finite number"),
+    ],
+)
+def test_constants_for_what_is_not_read_or_no_numbers_are_refused(text: str, match: str) -> None:
+    with pytest.raises(UsageError, match=match):
+        fill(small(), [text])
+
+
+def test_nothing_is_filled_for_models_that_read_no_samples() -> None:
+    with pytest.raises(UsageError, match="reads no samples"):
+        fill(NLM(), ["lens=0"])

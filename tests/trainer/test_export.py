@@ -20,7 +20,7 @@ from tests.conformance.test_denoisers import make
 from trainer.commands import export as command
 from trainer.export import SUFFIXES, Source, export, load_artifact
 from trainer.export.description import KEY, Description
-from trainer.export.entry import example
+from trainer.export.entry import Sampled, example
 from trainer.export.onnx import OPSET
 from trainer.export.parity import LIMIT, relative_error
 
@@ -75,7 +75,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def buffers_of(net: Denoiser, batch: int, height: int, width: int, seed: int = 5) -> dict[str, Tensor]:
-    return example(net.inputs, batch, height, width, seed)
+    return example(net.inputs, batch, height, width, seed, Sampled(net.samples, 3))
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -270,7 +270,7 @@ def test_a_foreign_torchscript_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_metadata_of_a_later_version_is_refused() -> None:
-    with pytest.raises(ValueError, match="known up to 1"):
+    with pytest.raises(ValueError, match="known up to 2; update penumbra-denoise"):
         Description.from_json(json.dumps({"version": 99}))
 
 

@@ -3,6 +3,7 @@ import json
 import os
 import shutil
 
+import h5py
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from data.derive import automatic_exposure
 from data.exr import read_frame
 from data.frames import FrameSet
 from data.ingestion import PARTIAL, IngestOptions, ingest
+from data.inspection import inspect_path
 from data.layouts import LAYOUTS
 from data.manifest import MANIFEST
 from tests.data import layout_samples as layer_samples
@@ -23,6 +25,7 @@ from tests.data.miniature import (
     write_rgb,
 )
 from trainer.commands import ingest as command
+from trainer.commands import inspect
 
 
 @pytest.fixture
@@ -344,6 +347,31 @@ def test_what_a_layout_assumed_and_normalised_is_in_the_record_and_the_report(tm
     assert "normalised by the source, no scene units: depth" in out
     assert "assumed: " in out
     assert "stored per sample: radiance, " in out
+
+
+def test_dropped_samples_are_in_the_record_the_report_and_what_inspect_says(tmp_path, capsys):
+    arrays = layer_samples.layer_pair(tmp_path / "source", "clip")
+    with h5py.File(tmp_path / "source" / "clip_input.h5", "r+") as file:
+        file["color"][0, 1, :, 2, 3] = np.nan
+        file["albedo"][1, :, 0, 1, 1] = np.inf
+    call(tmp_path / "source", "--layout", "layerdenoise", "--output", tmp_path / "set", "--processes", 1)
+    count = arrays["color"].shape[1]
+    told = f"{1 + count} samples with NaN or Inf in 2 pixels were dropped; 1 pixel had no other"
+    assert f"samples: {told}" in capsys.readouterr().out
+    frames = FrameSet(tmp_path / "set")
+    assert [f.remarks["dropped"] for f in frames.frames("clip")] == [[1, 1, 0], [count, 1, 1]]
+    frame = frames.read("clip", 1)
+    assert np.isnan(frame.samples.values[:, 1, 1]).all()
+    assert np.isfinite(frame.buffers["color"]).all()
+    found = inspect_path(tmp_path / "set")
+    assert found["scenes"]["clip"]["dropped"] == {"samples": 1 + count, "pixels": 2, "empty": 1}
+    assert found["first_frames"]["clip"]["samples"]["dropped"] == {"samples": 1, "pixels": 1, "empty": 0}
+    parser = argparse.ArgumentParser()
+    inspect.add_arguments(parser)
+    assert inspect.run(parser.parse_args([str(tmp_path / "set")])) == 0
+    out = capsys.readouterr().out
+    assert f"clip: samples: {told}" in out
+    assert "\nsamples: 1 sample with NaN or Inf in 1 pixel was dropped\n" in out
 
 
 def test_a_normal_that_was_decoded_is_in_the_report(tmp_path, capsys):

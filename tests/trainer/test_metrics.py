@@ -6,11 +6,13 @@ from trainer.metrics.collection import METRICS, SceneMetrics
 from trainer.metrics.functional import (
     levels,
     psnr_afgsa,
+    psnr_layer,
     psnr_wskp,
     rel_mse_half_afgsa,
     relmse_layer,
     smape_wskp,
     ssim_afgsa,
+    ssim_layer,
     ssim_wskp,
     ssim_wskp_range1,
 )
@@ -109,9 +111,9 @@ def eight_bit(image):
     return (np.clip(np.maximum(image.double().numpy(), 0) ** (1 / 2.2), 0, 1) * 255).astype(np.uint8)
 
 
-def gaussian_ssim(x, y):
+def gaussian_ssim(x, y, data_range=255):
     """One 11x11 window at a time, float64, weighted by a Gaussian of 1.5 pixels."""
-    c1, c2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     rows, columns = np.mgrid[-5:6, -5:6]
     weights = np.exp(-(rows**2 + columns**2) / (2 * 1.5**2))
     weights /= weights.sum()
@@ -141,6 +143,25 @@ def test_psnr_of_afgsa_is_on_8_bit_images():
     for o, r, found in zip(output, reference, psnr_afgsa(output, reference), strict=True):
         error = np.mean((eight_bit(o).astype(np.float64) - eight_bit(r)) ** 2)
         assert float(found) == pytest.approx(20 * np.log10(255 / np.sqrt(error)), abs=1e-5)
+
+
+def log_srgb(image):
+    """What the layer paper evaluates, by numpy: its equations 7 and 8, clipped to what can be shown."""
+    value = np.log(1 + np.maximum(image.double().numpy(), 0))
+    curve = np.where(value > 0.0031308, 1.055 * value ** (1 / 2.4) - 0.055, 12.92 * value)
+    return np.clip(curve, 0, 1)
+
+
+def test_psnr_and_ssim_of_the_layer_paper_are_on_its_tone_mapped_images_with_range_one():
+    output, reference = pair(6, size=(2, 3, 14, 16))
+    output[0, 0, 3, 4], reference[0, 0, 3, 4] = 50.0, 20.0  # both white
+    shown = [(log_srgb(o), log_srgb(r)) for o, r in zip(output, reference, strict=True)]
+    ratios = [-10 * np.log10(np.mean((o - r) ** 2)) for o, r in shown]
+    assert psnr_layer(output, reference).numpy() == pytest.approx(ratios, abs=1e-3)
+    similar = [gaussian_ssim(o, r, data_range=1) for o, r in shown]
+    assert ssim_layer(output, reference).numpy() == pytest.approx(similar, abs=1e-5)
+    with pytest.raises(ValueError, match="11x11"):
+        ssim_layer(output[..., :10, :], reference[..., :10, :])
 
 
 def test_levels_are_cut_off_and_not_rounded():
@@ -176,7 +197,7 @@ def test_every_metric_says_which_direction_is_better(name):
     assert (better > worse) == METRICS[name].higher
 
 
-def test_both_tables_fit_a_hundred_columns_and_say_how_metrics_are_defined(capsys):
+def test_all_tables_fit_a_hundred_columns_and_say_how_metrics_are_defined(capsys):
     scenes = ("average", "sponza-moving-light")
     logged = {
         f"{kind}/{name}{'' if scene == 'average' else '/' + scene}": 12.3456789
@@ -187,7 +208,7 @@ def test_both_tables_fit_a_hundred_columns_and_say_how_metrics_are_defined(capsy
     print_scores(logged, "test")
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 100
-    assert sum("sponza-moving-light" in line for line in lines) == 4
-    assert sum(line.count("12.35 dB") for line in lines) == 8
-    assert sum(line.startswith("Definitions:") for line in lines) == 2
+    assert sum("sponza-moving-light" in line for line in lines) == 6
+    assert sum(line.count("12.35 dB") for line in lines) == 12
+    assert sum(line.startswith("Definitions:") for line in lines) == 3
     assert "…" not in "".join(lines)

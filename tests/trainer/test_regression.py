@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models import WSKP
+from models import SBMC, WSKP
+from trainer.losses import RelativeL2
 from trainer.modules import Regression
 
 
@@ -37,6 +38,23 @@ def test_clipping_by_module_and_trainer_at_once_is_refused() -> None:
     module = Regression(WSKP(), clip_norm=1.0)
     with pytest.raises(ValueError, match=r"clipped twice: use --trainer\.gradient_clip_val null"):
         module.configure_gradient_clipping(torch.optim.SGD(module.net.parameters(), 0.1), 1.0, "norm")
+
+
+def test_pairs_are_compared_where_the_paper_compares_them() -> None:
+    torch.manual_seed(1)
+    net = SBMC(features=("radiance",), camera=False, width=4, rounds=1, levels=1, kernel_size=3)
+    samples, reference = torch.rand(1, 2, 3, 12, 10), torch.rand(1, 3, 12, 10)
+    exposure = torch.tensor([0.5])
+    batch = {"samples": samples, "reference": reference, "exposure": exposure}
+    module = Regression(net, RelativeL2(epsilon=0.01, factor=0.5), pairs=True)
+    module.log = lambda *_, **__: None  # type: ignore[method-assign]
+    color, target = ((x * 0.5)[..., 1:-1, 1:-1].double() for x in (net(batch).color, reference))
+    shown, wanted = color / (1 + color), target / (1 + target)
+    expected = 0.5 * ((shown - wanted) ** 2 / (wanted**2 + 0.01)).mean()
+    assert module.training_step(batch, 0).item() == pytest.approx(expected.item(), rel=1e-4)
+    assert module.validation_loss(batch, color, target).item() == pytest.approx(expected.item(), rel=1e-4)
+    plain = Regression(net, RelativeL2()).validation_loss(batch, color, target)
+    assert plain.item() == pytest.approx(((color - target) ** 2 / (target**2 + 0.01)).mean().item(), rel=1e-4)
 
 
 def test_clips_must_be_positive() -> None:

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from data.buffers import buffer
+from data.buffers import SAMPLES, buffer, sample_channels
 from models.denoiser import Denoised
+from models.ops.per_sample import check_samples, sample_depths
 from trainer.export.description import KEY, Description
 from trainer.export.entry import tracing
 from trainer.export.torchscript import EXTRA_FILE
@@ -36,6 +37,7 @@ class Artifact:
         description: The metadata of the file.
         inputs, frame_numbers, halo, multiple, temporal, per_sample, samples, fill: As declared by the
             denoiser.
+        bytes_per_pixel, bytes_once: Working memory, for tiling.
         frames, frame_halo: 0: exported files take images.
     """
 
@@ -53,6 +55,8 @@ class Artifact:
         self.per_sample = description.per_sample
         self.samples = description.samples
         self.fill = description.fill
+        self.bytes_per_pixel = description.bytes_per_pixel
+        self.bytes_once = description.bytes_once
         self._runtime = runtime
 
     def __call__(self, buffers: Mapping[str, Tensor]) -> Denoised:
@@ -70,7 +74,11 @@ class Artifact:
 
     def measure(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the frame numbers that need the whole frame, as the vocabulary defines them."""
-        if "depth_range" not in self.frame_numbers or "depth" not in buffers:
+        if "depth_range" not in self.frame_numbers:
+            return {}
+        if "depth" in self.samples and SAMPLES in buffers:
+            return {"depth_range": sample_depths(buffers[SAMPLES], self.samples)}
+        if "depth" not in buffers:
             return {}
         depth = buffers["depth"].flatten(1)
         return {"depth_range": torch.stack((depth.amin(1), depth.amax(1)), 1)}
@@ -95,9 +103,16 @@ class Artifact:
                 f"{self.name} needs the buffers {', '.join(self.inputs)}; missing: {', '.join(missing)}; "
                 f"given: {', '.join(buffers) or 'none'}"
             )
-        batch, _, height, width = buffers[self.inputs[0]].shape
+        first = buffers[self.inputs[0]].shape
+        batch, height, width = first[0], first[-2], first[-1]
         for name in self.inputs:
-            expected = (batch, buffer(name).channels, height, width)
+            if name == SAMPLES:
+                inner: tuple[int, ...] = check_samples(
+                    buffers[name], sample_channels(*self.samples), self.name
+                )
+            else:
+                inner = (buffer(name).channels,)
+            expected = (batch, *inner, height, width)
             if tuple(buffers[name].shape) != expected:
                 found = tuple(buffers[name].shape)
                 raise ValueError(f"{self.name}: buffer {name!r} has shape {found}, expected {expected}")

@@ -6,11 +6,12 @@ import copy
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from data.buffers import buffer
+from data.buffers import BUFFERS, SAMPLE_BUFFERS, SAMPLES, buffer
 from models.denoiser import Denoiser
 from trainer.export.description import DEFAULTS
 
@@ -29,7 +30,8 @@ class Entry(nn.Module):
         self.names = (*denoiser.inputs, *denoiser.frame_numbers)
 
     def forward(self, buffers: dict[str, Tensor]) -> Tensor:
-        """Return the color (B, 3, H, W) of buffers (B, C, H, W) and frame numbers (1 or B, …)."""
+        """Return the color (B, 3, H, W) of buffers (B, C, H, W), samples (B, S, C, H, W) and frame numbers
+        (1 or B, …)."""
         known = {name: buffers[name] for name in self.names}
         for name, measured in self.denoiser.measure(known).items():
             if name in known:
@@ -55,10 +57,6 @@ def prepare(denoiser: Denoiser) -> Denoiser:
     Raises:
         ValueError: The denoiser cannot be exported, and why.
     """
-    if denoiser.per_sample:
-        raise ValueError(
-            f"{type(denoiser).__name__} reads single samples; such models cannot be exported yet"
-        )
     if denoiser.no_export:
         raise ValueError(f"{type(denoiser).__name__} cannot be exported: {denoiser.no_export}")
     if denoiser.frames:
@@ -75,11 +73,58 @@ def default(name: str) -> Tensor:
     return value if len(DEFAULTS[name]) == 1 else value[None]
 
 
-def example(inputs: Iterable[str], batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+class Sampled(NamedTuple):
+    """Samples that are kept apart: their quantities in order, and how many there are per pixel."""
+
+    names: tuple[str, ...]
+    spp: int
+
+
+def example(
+    inputs: Iterable[str],
+    batch: int,
+    height: int,
+    width: int,
+    seed: int = 0,
+    samples: Sampled | None = None,
+) -> dict[str, Tensor]:
     """Return made-up inputs with the ranges of renders: heavy-tailed radiance with fireflies up to 6e4 and
-    black pixels, unit normals, depths with misses."""
+    black pixels, unit normals, depths with misses; among samples some with NaN or Inf, and pixels whose
+    samples all have."""
     generator = torch.Generator().manual_seed(seed)
-    return {name: _image(name, (batch, height, width), generator) for name in inputs}
+    size = (batch, height, width)
+    made = {}
+    for name in inputs:
+        if name == SAMPLES and samples is not None:
+            made[name] = _samples(samples, size, generator)
+        else:
+            made[name] = _image(name, size, generator)
+    return made
+
+
+def _samples(samples: Sampled, size: tuple[int, int, int], generator: torch.Generator) -> Tensor:
+    batch, height, width = size
+    flat = (batch * samples.spp, height, width)
+    made = torch.cat([_quantity(name, flat, generator) for name in samples.names], 1)
+    made = made.reshape(batch, samples.spp, -1, height, width)
+    lost = torch.rand((batch, samples.spp, height, width), generator=generator) < 0.03
+    lost |= torch.rand((batch, 1, height, width), generator=generator) < 0.01
+    lost[:, :, 1, 2] = True
+    made[:, :, 1] = made[:, :, 1].masked_fill(lost, torch.nan)
+    made[:, 0, 2, 3, 1] = torch.inf
+    return made
+
+
+def _quantity(name: str, size: tuple[int, int, int], generator: torch.Generator) -> Tensor:
+    """Return one quantity of single samples, (B, C, H, W)."""
+    plain = name.removeprefix("first_")
+    if plain in BUFFERS:
+        return _image(plain, size, generator)
+    entry = SAMPLE_BUFFERS[name]
+    shape = (size[0], len(entry.letters), *size[1:])
+    if entry.low is None or entry.high is None:
+        return 8 * torch.randn(shape, generator=generator)
+    return entry.low + (entry.high - entry.low) * torch.rand(shape, generator=generator)
 
 
 def _image(name: str, size: tuple[int, int, int], generator: torch.Generator) -> Tensor:
@@ -106,12 +151,14 @@ def _image(name: str, size: tuple[int, int, int], generator: torch.Generator) ->
 
 
 def numbers(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return frame numbers unlike the defaults: a different exposure per image, a widened measured range."""
+    """Return frame numbers unlike the defaults: a widened measured range, others different for each image."""
     batch = next(iter(buffers.values())).shape[0]
-    given = {name: value * 1.25 for name, value in denoiser.measure(buffers).items()}
-    if "exposure" in denoiser.frame_numbers:
-        given["exposure"] = torch.linspace(0.3, 2.5, batch)
-    return {name: value for name, value in given.items() if name in denoiser.frame_numbers}
+    measured = {name: value * 1.25 for name, value in denoiser.measure(buffers).items()}
+    given = {}
+    for name in denoiser.frame_numbers:
+        spread = torch.linspace(0.3, 2.5, batch * len(DEFAULTS[name]))
+        given[name] = measured.get(name, spread if len(DEFAULTS[name]) == 1 else spread.reshape(batch, -1))
+    return given
 
 
 @contextmanager

@@ -1,8 +1,9 @@
 """Export to ONNX.
 
 The graph's inputs carry the buffers' names, the output is `color` (`denoised` where `color` is an input);
-batch, height and width are free. Frame numbers are inputs with a default value: an initializer of the same
-name, which ONNX lets the caller override. ONNX Runtime lists them under `get_overridable_initializers()`.
+batch, samples per pixel, height and width are free. Frame numbers are inputs with a default value: an
+initializer of the same name, which ONNX lets the caller override. ONNX Runtime lists them under
+`get_overridable_initializers()`.
 
 PyTorch has two exporters. On a convolution, box-filter and softmax network like WSKP (torch 2.13, two CPU
 cores) the one that traces took 0.2 s and gave a file that runs with every batch and size; the one built on
@@ -19,9 +20,10 @@ from pathlib import Path
 import onnx
 import torch
 
+from data.buffers import SAMPLES, sample_channels
 from models.denoiser import Denoiser
 from trainer.export.description import KEY, Description, output_name
-from trainer.export.entry import Entry, Positional, default, example, tracing
+from trainer.export.entry import Entry, Positional, Sampled, default, example, tracing
 
 OPSET = 17
 """ONNX operator set: the oldest one with every operator in use, which ONNX Runtime has since 1.12."""
@@ -29,11 +31,13 @@ OPSET = 17
 
 def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
     """Return the ONNX file of a prepared denoiser, and what the tracer doubted."""
-    buffers = example(denoiser.inputs, 2, 48, 32)
+    buffers = example(denoiser.inputs, 2, 48, 32, samples=Sampled(denoiser.samples, 3))
     given = {name: default(name) for name in denoiser.frame_numbers}
     output = output_name(tuple(denoiser.inputs))
     free = {0: "batch", 2: "height", 3: "width"}
     axes = dict.fromkeys((*buffers, output), free) | {name: {0: "frames"} for name in given}
+    if SAMPLES in buffers:
+        axes[SAMPLES] = {0: "batch", 1: "samples", 3: "height", 4: "width"}
     entry = Entry(denoiser).eval()
     # Two rows: the tracer would otherwise see a batch of one and leave out broadcasts.
     tensors = tuple(buffers.values()) + tuple(value.repeat_interleave(2, 0) for value in given.values())
@@ -59,6 +63,12 @@ def describe_file(content: bytes, description: Description) -> bytes:
         f"{', '.join(description.inputs)}. "
         f"Optional: {', '.join(description.frame_numbers) or 'nothing'}."
     )
+    if description.per_sample:
+        channels = ", ".join(sample_channels(*description.samples))
+        model.doc_string += (
+            f" `{SAMPLES}` (B, S, C, H, W): any number S of samples per pixel, C channels in this order: "
+            f"{channels}. Samples with a channel that is NaN or Inf do not count."
+        )
     del model.metadata_props[:]
     model.metadata_props.add(key=KEY, value=replace(description, format="onnx").to_json())
     return model.SerializeToString()

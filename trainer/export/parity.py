@@ -15,7 +15,7 @@ from torch import Tensor
 from models.denoiser import Denoiser
 from trainer.export.artifact import Artifact
 from trainer.export.description import Parity
-from trainer.export.entry import example, numbers
+from trainer.export.entry import Sampled, example, numbers
 
 LIMIT = 1e-4
 ROUNDING = 2.0
@@ -24,6 +24,8 @@ UNUSABLE = 1e-2
 """An error that no rounding excuses."""
 SIZES = ((1, 17, 31), (2, 63, 50), (1, 128, 128), (2, 45, 80), (3, 16, 97))
 """(batch, height, width): none is the size that was traced, most are odd."""
+COUNTS = (3, 8, 1, 2, 5)
+"""Samples per pixel at each of these sizes."""
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
@@ -38,7 +40,7 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 
 @torch.inference_mode()
 def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: float = LIMIT) -> Parity:
-    """Compare an artifact with the eager, deployed, float32 module on `SIZES`.
+    """Compare an artifact with the eager, deployed, float32 module on `SIZES` (and `COUNTS`).
 
     Each size is run without frame numbers and with numbers unlike the defaults, on inputs with fireflies.
     Networks that end in an exponential magnify rounding: where the difference exceeds the limit, both are
@@ -48,12 +50,13 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
         ValueError: The artifact fails at a size or differs by more than that; the message says where.
     """
     worst = rounding = 0.0
-    sizes = tuple((b, _round(h, denoiser.multiple), _round(w, denoiser.multiple)) for b, h, w in SIZES)
-    for seed, (batch, height, width) in enumerate(sizes):
-        plain = example(denoiser.inputs, batch, height, width, seed)
+    for seed, (size, count) in enumerate(zip(SIZES, COUNTS, strict=True)):
+        plain = example(denoiser.inputs, *size, seed, Sampled(denoiser.samples, count))
         _compare_measured(artifact, denoiser, plain)
+        place = f"batch {size[0]}, {size[2]}x{size[1]}"
+        if denoiser.per_sample:
+            place += f", {count} samples per pixel"
         for buffers in (plain, plain | numbers(denoiser, plain)):
-            place = f"batch {batch}, {width}x{height}"
             expected = denoiser(buffers).color
             try:
                 found = artifact(buffers).color
@@ -68,7 +71,7 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
                     )
                 rounding = max(rounding, own)
             worst = max(worst, error)
-    return Parity(worst, limit, sizes, runtime, rounding)
+    return Parity(worst, limit, SIZES, runtime, rounding, COUNTS if denoiser.per_sample else ())
 
 
 def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
@@ -92,7 +95,3 @@ def _compare_measured(artifact: Artifact, denoiser: Denoiser, buffers: Mapping[s
                 f"{type(denoiser).__name__} measures {name!r} in its own way, so that tiles of an exported "
                 "file would differ; follow the definition in data.buffers.FRAME_NUMBERS"
             )
-
-
-def _round(size: int, multiple: int) -> int:
-    return -(-size // multiple) * multiple

@@ -15,21 +15,25 @@ from typing import Any, TextIO
 import numpy as np
 import onnx
 
-from data.buffers import buffer
+from data.buffers import SAMPLES, buffer, sample_channels
 from trainer.export.artifact import Artifact, load_artifact
-from trainer.export.entry import example
+from trainer.export.entry import Sampled, default, example
 
 EXAMPLE_SIZE = (24, 32)
 """Height and width of the input example."""
+
+EXAMPLE_SAMPLES = 4
+"""Samples per pixel, where they are kept apart."""
 
 
 def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri: str) -> str:
     """Log an exported ONNX file with a run and register it as a new version of a model.
 
-    The signature lists the buffers with free batch, height and width, and `exposure`: MLflow drops inputs
-    that a signature does not list, and an exposure that is silently dropped gives a wrong picture. The depth
-    range is left to the model, which measures it from the image. `mlflow.pyfunc.load_model(uri).predict`
-    takes a dictionary of float32 arrays and returns `{"color": …}`.
+    The signature lists the buffers with free batch, height, width and number of samples, and `exposure`:
+    MLflow drops inputs that a signature does not list, and an exposure that is silently dropped gives a wrong
+    picture; the same goes for `thin_lens`. The depth range is left to the model, which measures it from the
+    image. `mlflow.pyfunc.load_model(uri).predict` takes a dictionary of float32 arrays and returns
+    `{"color": …}`.
 
     Args:
         run_id: Run that the model belongs to.
@@ -159,19 +163,28 @@ def _signature(artifact: Artifact) -> Any:
     from mlflow.types import Schema, TensorSpec
 
     single = np.dtype(np.float32)
-    inputs: list[Any] = [
-        TensorSpec(single, (-1, buffer(name).channels, -1, -1), name) for name in artifact.inputs
-    ]
-    if "exposure" in artifact.frame_numbers:
-        inputs.append(TensorSpec(single, (-1,), "exposure"))
+    inputs: list[Any] = [TensorSpec(single, _shape(name, artifact), name) for name in artifact.inputs]
+    for name in _listed(artifact):
+        inputs.append(TensorSpec(single, (-1, *default(name).shape[1:]), name))
     return ModelSignature(
         inputs=Schema(inputs),
         outputs=Schema([TensorSpec(single, (-1, 3, -1, -1), artifact.description.output)]),
     )
 
 
+def _shape(name: str, artifact: Artifact) -> tuple[int, ...]:
+    """Return the shape of an input, -1 for what is free: images, samples per pixel, rows, columns."""
+    if name == SAMPLES:
+        return (-1, -1, len(sample_channels(*artifact.samples)), -1, -1)
+    return (-1, buffer(name).channels, -1, -1)
+
+
 def _example(artifact: Artifact) -> dict[str, Any]:
-    arrays = {name: value.numpy() for name, value in example(artifact.inputs, 1, *EXAMPLE_SIZE).items()}
-    if "exposure" in artifact.frame_numbers:
-        arrays["exposure"] = np.ones(1, np.float32)
-    return arrays
+    made = example(artifact.inputs, 1, *EXAMPLE_SIZE, samples=Sampled(artifact.samples, EXAMPLE_SAMPLES))
+    arrays = {name: value.numpy() for name, value in made.items()}
+    return arrays | {name: default(name).numpy() for name in _listed(artifact)}
+
+
+def _listed(artifact: Artifact) -> list[str]:
+    """Return the frame numbers that callers must give: those that the model cannot measure."""
+    return [name for name in artifact.frame_numbers if name != "depth_range"]

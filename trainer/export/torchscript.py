@@ -8,25 +8,41 @@ every network to be written in TorchScript's subset of Python.
 from __future__ import annotations
 
 import io
-from typing import Dict, cast  # noqa: UP035 - TorchScript reads these annotations
+from typing import Dict, List, cast  # noqa: UP035 - TorchScript reads these annotations
 
 import torch
 from torch import Tensor, nn
 
+from data.buffers import sample_channels
 from models.denoiser import Denoiser
 from trainer.export.description import Description
-from trainer.export.entry import Entry, default, example, tracing
+from trainer.export.entry import Entry, Sampled, default, example, tracing
 
 EXTRA_FILE = "penumbra.json"
 
 
 class Shell(nn.Module):
-    """Checks the names, fills in frame numbers that are missing, calls the traced network."""
+    """Checks the names, fills in frame numbers that are missing, calls the traced network.
 
-    def __init__(self, core: nn.Module, inputs: tuple[str, ...], defaults: dict[str, Tensor]) -> None:
+    Weights in loops over rows (`models.ops.loops`) are constants: `torch.jit.load(…, map_location=device)`
+    brings all to a device, `module.to(device)` does not.
+
+    Attributes:
+        inputs: Names of the buffers.
+        sample_channels: Channels of `samples`, in order; empty where it is not read.
+    """
+
+    def __init__(
+        self,
+        core: nn.Module,
+        inputs: tuple[str, ...],
+        defaults: dict[str, Tensor],
+        sample_channels: tuple[str, ...],
+    ) -> None:
         super().__init__()
         self.core = core
         self.inputs = list(inputs)
+        self.sample_channels = cast(list[str], torch.jit.Attribute(list(sample_channels), List[str]))  # noqa: UP006
         # TorchScript cannot infer the type of an empty dictionary.
         self.defaults = cast(dict[str, Tensor], torch.jit.Attribute(defaults, Dict[str, Tensor]))  # noqa: UP006
 
@@ -37,6 +53,12 @@ class Shell(nn.Module):
             if name not in buffers:
                 raise ValueError("missing buffer " + name)
             known[name] = buffers[name]
+            if name == "samples":
+                shape, channels = buffers[name].shape, self.sample_channels
+                if len(shape) != 5 or shape[1] == 0 or shape[2] != len(channels):
+                    raise ValueError(
+                        "samples must be (B, S, C, H, W) with the channels " + ", ".join(channels)
+                    )
         device = buffers[self.inputs[0]].device
         for name, value in self.defaults.items():
             known[name] = buffers[name] if name in buffers else value.to(device)
@@ -46,12 +68,12 @@ class Shell(nn.Module):
 def build(denoiser: Denoiser) -> tuple[torch.jit.ScriptModule, list[str]]:
     """Return the scripted shell of a prepared denoiser, and what the tracer doubted."""
     given = {name: default(name) for name in denoiser.frame_numbers}
-    buffers = example(denoiser.inputs, 2, 48, 32) | {
-        name: v.repeat_interleave(2, 0) for name, v in given.items()
-    }
+    buffers = example(denoiser.inputs, 2, 48, 32, samples=Sampled(denoiser.samples, 3))
+    buffers |= {name: v.repeat_interleave(2, 0) for name, v in given.items()}
+    channels = sample_channels(*denoiser.samples)
     with tracing() as doubts, torch.no_grad():
         core = torch.jit.trace(Entry(denoiser).eval(), (buffers,), check_trace=False)
-        module = torch.jit.script(Shell(core, tuple(denoiser.inputs), given).eval())
+        module = torch.jit.script(Shell(core, tuple(denoiser.inputs), given, channels).eval())
     return module, doubts
 
 

@@ -27,7 +27,7 @@ class Measure:
     function: Callable[[Tensor, Tensor], Tensor]
     higher: bool
     format: str
-    source: Literal["wskp", "afgsa"]
+    source: Literal["wskp", "afgsa", "layer"]
 
 
 METRICS: dict[str, Measure] = {
@@ -39,6 +39,8 @@ METRICS: dict[str, Measure] = {
     "psnr_afgsa": Measure(functional.psnr_afgsa, True, "{:.2f} dB", "afgsa"),
     "ssim_afgsa": Measure(functional.ssim_afgsa, True, "{:.4f}", "afgsa"),
     "rel_mse_half_afgsa": Measure(functional.rel_mse_half_afgsa, False, "{:.6f}", "afgsa"),
+    "psnr_layer": Measure(functional.psnr_layer, True, "{:.2f} dB", "layer"),
+    "ssim_layer": Measure(functional.ssim_layer, True, "{:.4f}", "layer"),
 }
 """Name in tables and logs → the metric."""
 
@@ -49,6 +51,9 @@ SOURCES: dict[str, str] = {
     "afgsa": "as AFGSA and ACFM print them: PSNR and SSIM (Gaussian 11x11 window, range 255) on 8-bit images "
     "of exposed radiance, clamp(x^(1/2.2), 0, 1) * 255 truncated; rel_mse_half_afgsa: "
     '0.5 mean (o - r)^2 / (r^2 + 0.01), their "RMSE".',
+    "layer": "as Munkberg and Hasselgren 2020, beside relmse_layer and smape_wskp, which are theirs too: on "
+    "clamp(sRGB(log(1 + x)), 0, 1) of exposed radiance, range 1; the window of SSIM (Gaussian 11x11) is not "
+    "in the paper.",
 }
 """Group of metrics → how they are defined."""
 

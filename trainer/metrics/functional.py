@@ -2,7 +2,8 @@
 
 Every function takes linear radiance (B, 3, H, W), already multiplied by the exposure at which it is to be
 judged, and returns one float32 number per image (B,). The transfer "gamma" of WSKP, NBGD and MR-KP is
-`clamp(max(x, 0) ** 0.454545, 0, 1)`; AFGSA and ACFM evaluate 8-bit images (`levels`).
+`clamp(max(x, 0) ** 0.454545, 0, 1)`; AFGSA and ACFM evaluate 8-bit images (`levels`); the layer paper
+`clamp(sRGB(log(1 + x)), 0, 1)` (`compressed`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from models.ops.tonemap import srgb_log
 
 GAMMA = 0.454545
 
@@ -123,7 +126,45 @@ def ssim_afgsa(
         ValueError: The image is smaller than the window.
     """
     _check_window(output, size)
-    x, y = levels(output, exponent), levels(reference, exponent)
+    return _gaussian_similarity(
+        levels(output, exponent), levels(reference, exponent), size, sigma, data_range
+    )
+
+
+def compressed(radiance: Tensor) -> Tensor:
+    """Return the display values in [0, 1] on which the layer paper evaluates: sRGB(log(1 + x)), float64.
+
+    Equations 7 and 8 of Munkberg and Hasselgren 2020; white is radiance 1.72.
+    """
+    return srgb_log(radiance.double()).clamp(0, 1)
+
+
+def psnr_layer(output: Tensor, reference: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB as in the layer paper: `compressed` images, peak 1; equal ones: inf."""
+    error = torch.square(compressed(output) - compressed(reference)).flatten(1).mean(1)
+    return (-10 * torch.log10(error)).float()
+
+
+def ssim_layer(output: Tensor, reference: Tensor, size: int = 11, sigma: float = 1.5) -> Tensor:
+    """Structural similarity on the layer paper's tone-mapped images, range 1.
+
+    The paper does not give window or range: these are of Wang et al. 2004, a Gaussian with biased variances.
+
+    Args:
+        output: Exposed radiance.
+        reference: What it should be.
+        size: Side of the window.
+        sigma: Standard deviation of the window in pixels.
+
+    Raises:
+        ValueError: The image is smaller than the window.
+    """
+    _check_window(output, size)
+    return _gaussian_similarity(compressed(output), compressed(reference), size, sigma, 1.0)
+
+
+def _gaussian_similarity(x: Tensor, y: Tensor, size: int, sigma: float, data_range: float) -> Tensor:
+    """Return the mean similarity per image under a Gaussian window, with biased variances."""
     offsets = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
     weights = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
     weights = weights / weights.sum()

@@ -15,6 +15,8 @@ from models.ops.gather import pad_border
 from tests.models.ops.test_splat import close, made
 from tests.models.plain_splat import plain_gather_samples, plain_splat_softmax
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 @pytest.fixture(params=[1, 60, 1 << 14], ids=["row by row", "some rows", "at once"])
 def chunk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models.ops import kernel_blocks
-from models.ops.splat import Splatted, gather_inside, gather_weighted, splat, splat_exp, splat_shifted
+from models.ops.splat import (
+    Splatted,
+    gather_inside,
+    gather_weighted,
+    splat,
+    splat_apart,
+    splat_exp,
+    splat_shifted,
+)
 from tests.benchmarks.memory import peak_bytes
 from tests.models.plain_splat import fold_gather, fold_splat, plain_splat
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def made(
@@ -180,6 +190,42 @@ def test_gradients_are_those_of_finite_differences() -> None:
     image, weights = values[:, 0].detach().requires_grad_(), logits[:, 0].detach().requires_grad_()
     assert check(lambda v, w: gather_weighted(v, w, 3), (image, weights))
     assert check(lambda v, w: gather_inside(v, w, 3), (image, weights))
+
+
+def test_layers_that_are_kept_apart_share_their_largest_logit_in_values_and_gradients() -> None:
+    values, logits = (t.requires_grad_() for t in made(5, 6, 7))
+    own = (logits - logits.amax((1, 2), keepdim=True)).exp()
+    apart = [fold_splat(values[:, n : n + 1], own[:, n : n + 1], 5)[0] for n in range(values.shape[1])]
+    expected, found = torch.stack(apart, 1), splat_apart(values, logits, 5)
+    close((found,), (expected,))
+    close((splat_apart(values, logits, 5, beyond=True)[..., 2:-2, :],), (expected,))
+    close(
+        *(torch.autograd.grad(made_.square().sum().sqrt(), (values, logits)) for made_ in (found, expected))
+    )
+
+
+def test_a_gather_equals_the_loop_over_pixels_and_offsets() -> None:
+    values, weights = made(3, 4, 5, 1, 1, 2)
+    image, kernels = values[:, 0], weights[:, 0]
+    expected = torch.zeros_like(image)
+    for y in range(4):
+        for x in range(5):
+            for index in range(9):
+                row, column = y + index // 3 - 1, x + index % 3 - 1
+                if 0 <= row < 4 and 0 <= column < 5:
+                    expected[:, :, y, x] += kernels[:, index, y, x, None] * image[:, :, row, column]
+    close((gather_weighted(image, kernels, 3),), (expected,))
+
+
+def test_an_impulse_is_gathered_by_the_mirrored_kernels_of_its_neighbours() -> None:
+    _, weights = made(3, 5, 5, 1, 1, 1)
+    image = torch.zeros(1, 1, 5, 5, dtype=torch.float64)
+    image[..., 2, 3] = 1.0
+    found = gather_weighted(image, weights[:, 0], 3)[0, 0]
+    for index in range(9):
+        row, column = 2 - (index // 3 - 1), 3 - (index % 3 - 1)
+        assert found[row, column] == weights[0, 0, index, row, column]
+    assert found.count_nonzero() == 9
 
 
 def test_equal_logits_have_a_gradient_that_is_a_subgradient_of_the_maximum() -> None:
