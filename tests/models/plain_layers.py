@@ -205,16 +205,13 @@ def pixel_gather(state: State, samples: Tensor, size: int, farthest: float) -> T
     embedding = dense(state, "reducer", torch.cat([mean, variance]), linear=False)  # type: ignore[list-item]
     context = unet(state, embedding)[0]
     logits = dense(state, "generator", torch.cat([embedding, context]), True)
-    kernels = (logits - logits.amax(0)).exp()
     image = samples[:, RADIANCE].mean(0)
     out, (_, height, width), reach = torch.zeros_like(image), image.shape, size // 2
     for y in range(height):
         for x in range(width):
-            total, colour = torch.zeros((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-            for tap in range(size * size):
-                row, column = y + tap // size - reach, x + tap % size - reach
-                if 0 <= row < height and 0 <= column < width:
-                    colour = colour + kernels[tap, y, x] * image[:, row, column]
-                    total = total + kernels[tap, y, x]
-            out[:, y, x] = colour / total
+            places = [(tap, y + tap // size - reach, x + tap % size - reach) for tap in range(size * size)]
+            inside = [(t, row, col) for t, row, col in places if 0 <= row < height and 0 <= col < width]
+            kernel = torch.softmax(torch.stack([logits[tap, y, x] for tap, _, _ in inside]), 0)
+            for weight, (_, row, column) in zip(kernel, inside, strict=True):
+                out[:, y, x] += weight * image[:, row, column]
     return out
