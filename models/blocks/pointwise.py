@@ -62,16 +62,14 @@ class Pointwise(nn.Module):
 def mixed(maps: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Return the 1x1 convolution of maps (N, C, H, W) with weights (C', C, 1, 1), (N, C', H, W).
 
-    In inference on a CPU it is a product of matrices: for 2 to 32 channels that takes a half to an eighth of
-    the time. In training that is not faster.
+    In inference on a CPU it is a product of matrices, which for 2 to 32 channels is up to eight times as fast.
+    In training it is not faster.
     """
     if exporting() or torch.is_grad_enabled() or maps.device.type != "cpu":
         return F.conv2d(maps, weight, bias)
-    matrices, columns = weight[None, :, :, 0, 0].expand(len(maps), -1, -1), maps.flatten(2)
-    if bias is None:
-        made = torch.bmm(matrices, columns)
-    else:
-        made = torch.baddbmm(bias[:, None], matrices, columns)
+    made = torch.matmul(weight[:, :, 0, 0], maps.flatten(2))
+    if bias is not None:
+        made.add_(bias[:, None])
     return made.unflatten(2, maps.shape[2:])
 
 

@@ -86,7 +86,8 @@ def known(samples: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
     """
     far = [channel.partition(".")[0] in MAY_BE_INFINITE for channel in sample_channels(*names)]
     if any(far):
-        mask = torch.tensor(far, device=samples.device).reshape(-1, 1, 1)
+        # Not torch.tensor: recorded graphs would hold the device on which they were recorded.
+        mask = torch.stack([samples.new_full((1, 1), float(one)) for one in far]) > 0
         samples = samples.where(~(mask & samples.isinf()), 0.0)
     counts = whole(samples)
     return samples.where(counts, 0.0), counts

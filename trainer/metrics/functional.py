@@ -140,7 +140,7 @@ def compressed(radiance: Tensor) -> Tensor:
 
 
 def psnr_layer(output: Tensor, reference: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB as in the layer paper: `compressed` images, peak 1; equal ones: inf."""
+    """Signal-to-noise ratio in dB as in the layer paper: `compressed` images, peak 1; inf where equal."""
     error = torch.square(compressed(output) - compressed(reference)).flatten(1).mean(1)
     return (-10 * torch.log10(error)).float()
 
