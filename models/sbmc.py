@@ -110,7 +110,7 @@ class SBMC(Denoiser):
 
     inputs = (SAMPLES,)
     per_sample = True
-    bytes_per_pixel = 12000
+    bytes_once = 1 << 26  # strips of kernels and hidden layers
 
     def __init__(
         self,
@@ -148,6 +148,10 @@ class SBMC(Denoiser):
         )
         self.unets = nn.ModuleList(Context(width, levels) for _ in range(rounds))
         self.regressor = Chain(2 * width, width, width, kernel_size**2, slope=0.01)
+        # Measured at 512x512: 6400. A gather has the kernels of a whole image.
+        self.bytes_per_pixel = 4 * width * (rounds + 11)
+        if filter == "gather":
+            self.bytes_per_pixel += 5 * (kernel_size**2 + 3 * width)
         self.halo = kernel_size // 2
         for _ in range(rounds):
             self.halo = Context.reach(self.halo, levels)

@@ -62,8 +62,8 @@ class Pointwise(nn.Module):
 def mixed(maps: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Return the 1x1 convolution of maps (N, C, H, W) with weights (C', C, 1, 1), (N, C', H, W).
 
-    In inference on a CPU it is a product of matrices, which for 2 to 32 channels is up to eight times as fast.
-    In training it is not faster.
+    In inference on a CPU it is a product of matrices, which for 2 to 32 channels is up to eight times as
+    fast. In training it is not faster.
     """
     if exporting() or torch.is_grad_enabled() or maps.device.type != "cpu":
         return F.conv2d(maps, weight, bias)

@@ -34,20 +34,24 @@ def looped(
         numbers: Numbers per pixel of its widest intermediate result, batch included.
     """
 
+    every = (*tensors, *shared)
+    Every = _tuple_of(every)
+
     def record() -> Any:
         step = _recorded(function, tensors, shared)
 
-        def loop(tensors: list[Tensor], shared: list[Tensor], numbers: Tensor, chunk: int) -> Tensor:
-            height, width = tensors[0].size(-2), tensors[0].size(-1)
+        def loop(every: Every, numbers: Tensor, chunk: int) -> Tensor:  # type: ignore[valid-type]
+            first_image = torch.jit.annotate(Every, every)[0]
+            height, width = first_image.size(-2), first_image.size(-1)
             rows = max(1, chunk // max(int(numbers) * width, 1))
             parts: list[Tensor] = []
             for first in range(0, height, rows):
-                parts.append(step([image[..., first : first + rows, :] for image in tensors] + shared))
+                parts.append(step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height)))
             return torch.cat(parts, -2)
 
         return torch.jit.script(loop)
 
-    return _outside(record)(list(tensors), list(shared), _counted(numbers), CHUNK)
+    return _outside(record)(every, _counted(numbers), CHUNK)
 
 
 def overlapped(
@@ -72,25 +76,23 @@ def overlapped(
         (…, H + 2 reach, W).
     """
 
+    every = (*tensors, *shared)
+    Every = _tuple_of(every)
+
     def record() -> Any:
         step = _recorded(function, tensors, shared)
-        made = function(*tensors, *shared)[..., :1, :]
+        made = function(*every)[..., :1, :]
         both = torch.jit.trace(join, (made, made + 1), check_trace=False)
 
-        def loop(
-            tensors: list[Tensor],
-            shared: list[Tensor],
-            numbers: Tensor,
-            chunk: int,
-            overlap: int,
-        ) -> Tensor:
-            height, width = tensors[0].size(-2), tensors[0].size(-1)
+        def loop(every: Every, numbers: Tensor, chunk: int, overlap: int) -> Tensor:  # type: ignore[valid-type]
+            first_image = torch.jit.annotate(Every, every)[0]
+            height, width = first_image.size(-2), first_image.size(-1)
             rows = max(1, chunk // max(int(numbers) * width, 1))
-            made = step([image[..., :rows, :] for image in tensors] + shared)
+            made = step(every, 0 * numbers, 0 * numbers + min(rows, height))
             parts = [made[..., :-overlap, :]]
             last = made[..., -overlap:, :]
             for first in range(rows, height, rows):
-                made = step([image[..., first : first + rows, :] for image in tensors] + shared)
+                made = step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height))
                 made = torch.cat([both(made[..., :overlap, :], last), made[..., overlap:, :]], -2)
                 parts.append(made[..., :-overlap, :])
                 last = made[..., -overlap:, :]
@@ -99,12 +101,27 @@ def overlapped(
 
         return torch.jit.script(loop)
 
-    return _outside(record)(list(tensors), list(shared), _counted(numbers), CHUNK, 2 * reach)
+    return _outside(record)(every, _counted(numbers), CHUNK, 2 * reach)
+
+
+def _tuple_of(tensors: Sequence[Tensor]) -> Any:
+    """Return the type of a tuple of so many tensors. ONNX would copy the members of a list for each strip.
+
+    A scripted function finds a type that it names in its body.
+    """
+    return tuple[(Tensor,) * len(tensors)]  # type: ignore[misc]
 
 
 def _recorded(function: Callable[..., Tensor], tensors: Sequence[Tensor], shared: Sequence[Tensor]) -> Any:
-    every = [tensor.detach() for tensor in (*tensors, *shared)]
-    step = torch.jit.trace(lambda every: function(*every), (every,), check_trace=False)
+    """Return a graph that cuts rows from `first` to `last` and calls the function."""
+    every = tuple(tensor.detach() for tensor in (*tensors, *shared))
+    cut = len(tensors)
+
+    def strip(every: tuple[Tensor, ...], first: Tensor, last: Tensor) -> Tensor:
+        return function(*(image[..., first:last, :] for image in every[:cut]), *every[cut:])
+
+    rows = torch.zeros((), dtype=torch.int64), torch.ones((), dtype=torch.int64) * tensors[0].shape[-2]
+    step = torch.jit.trace(strip, (every, *rows), check_trace=False)
     # The sizes of this example would count as constants where the loop is inlined; ONNX needs the ranks.
     for node in step.graph.nodes():
         for value in node.outputs():

@@ -15,6 +15,7 @@ from data.buffers import MAY_BE_INFINITE, SAMPLE_BUFFERS, sample_channels
 from models.ops.boxes import exporting
 from models.ops.guides import depth_range, finite
 from models.ops.loops import looped
+from models.ops.streaming import strip_rows
 
 
 def arranged(
@@ -102,7 +103,10 @@ def sample_depths(samples: Tensor, names: Sequence[str]) -> Tensor:
     """
     place = sample_channels(*names).index("depth.Z")
     if not torch.jit.is_tracing():
-        parts = [samples] if exporting() else samples.split(1, 1)  # one sample at a time
+        parts = [samples]
+        if not exporting():  # strips of single samples
+            rows = strip_rows(samples, samples.shape[0] * samples.shape[2])
+            parts = [strip for one in samples.split(1, 1) for strip in one.split(rows, -2)]
         each = torch.stack([depth_range(known(part, names)[0][:, :, place]) for part in parts])
         return torch.stack([each[..., 0].amin(0), each[..., 1].amax(0)], 1)
 
