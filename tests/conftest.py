@@ -1,11 +1,15 @@
-"""Fixtures of the tests of networks and filters; a module asks for them with `pytestmark`."""
+"""Fixtures of the tests of networks and filters, for which a module asks with `pytestmark`; Triton's mode."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 import torch
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is first imported, by whichever test
 
 
 @pytest.fixture

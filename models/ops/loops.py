@@ -34,24 +34,7 @@ def looped(
         numbers: Numbers per pixel of its widest intermediate result, batch included.
     """
 
-    every = (*tensors, *shared)
-    Every = _tuple_of(every)
-
-    def record() -> Any:
-        step = _recorded(function, tensors, shared)
-
-        def loop(every: Every, numbers: Tensor, chunk: int) -> Tensor:  # type: ignore[valid-type]
-            first_image = torch.jit.annotate(Every, every)[0]
-            height, width = first_image.size(-2), first_image.size(-1)
-            rows = max(1, chunk // max(int(numbers) * width, 1))
-            parts: list[Tensor] = []
-            for first in range(0, height, rows):
-                parts.append(step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height)))
-            return torch.cat(parts, -2)
-
-        return torch.jit.script(loop)
-
-    return _outside(record)(every, _counted(numbers), CHUNK)
+    return _run(function, (tensors, shared), numbers, 0, torch.add)
 
 
 def overlapped(
@@ -76,32 +59,85 @@ def overlapped(
         (…, H + 2 reach, W).
     """
 
-    every = (*tensors, *shared)
-    Every = _tuple_of(every)
+    return _run(function, (tensors, shared), numbers, 2 * reach, join)
+
+
+def _run(
+    function: Callable[..., Tensor],
+    tensors: tuple[Sequence[Tensor], Sequence[Tensor]],
+    numbers: int,
+    overlap: int,
+    join: Join,
+) -> Tensor:
+    every = (*tensors[0], *tensors[1])
 
     def record() -> Any:
-        step = _recorded(function, tensors, shared)
+        step = _recorded(function, *tensors)
         made = function(*every)[..., :1, :]
         both = torch.jit.trace(join, (made, made + 1), check_trace=False)
+        kind = _tuple_of(every)
+        if not torch.onnx.is_in_onnx_export():
+            return _in_place(step, both, kind)
+        return _overlapping_parts(step, both, kind) if overlap else _parts(step, kind)
 
-        def loop(every: Every, numbers: Tensor, chunk: int, overlap: int) -> Tensor:  # type: ignore[valid-type]
-            first_image = torch.jit.annotate(Every, every)[0]
-            height, width = first_image.size(-2), first_image.size(-1)
-            rows = max(1, chunk // max(int(numbers) * width, 1))
-            made = step(every, 0 * numbers, 0 * numbers + min(rows, height))
-            parts = [made[..., :-overlap, :]]
+    return _outside(record)(every, _counted(numbers), CHUNK, overlap)
+
+
+def _in_place(step: Any, both: Any, Every: Any) -> Any:
+    """Return the loop that writes into the result. Parts that stay would break up the memory of those that
+    go, with which TorchScript's allocator ends up taking several times as much."""
+
+    def loop(every: Every, numbers: Tensor, chunk: int, overlap: int) -> Tensor:
+        image = torch.jit.annotate(Every, every)[0]
+        height, rows = image.size(-2), max(1, chunk // max(int(numbers) * image.size(-1), 1))
+        out = torch.empty(0)
+        for first in range(0, height, rows):
+            made = step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height))
+            if first == 0:
+                sizes = made.size()
+                sizes[-2] = height + overlap
+                out = made.new_empty(sizes)
+            elif overlap > 0:
+                before = out[..., first : first + overlap, :]
+                made[..., :overlap, :] = both(made[..., :overlap, :], before)
+            out[..., first : first + made.size(-2), :] = made
+        return out
+
+    return torch.jit.script(loop)
+
+
+def _parts(step: Any, Every: Any) -> Any:
+    """Return the loop for ONNX, which has no tensors that are written into; nothing overlaps."""
+
+    def loop(every: Every, numbers: Tensor, chunk: int, overlap: int) -> Tensor:
+        image = torch.jit.annotate(Every, every)[0]
+        height, rows = image.size(-2), max(1, chunk // max(int(numbers) * image.size(-1), 1))
+        parts: list[Tensor] = []
+        for first in range(0, height, rows):
+            parts.append(step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height)))
+        return torch.cat(parts, -2)
+
+    return torch.jit.script(loop)
+
+
+def _overlapping_parts(step: Any, both: Any, Every: Any) -> Any:
+    """Return the loop for ONNX where strips overlap: the last rows of one wait for the next."""
+
+    def loop(every: Every, numbers: Tensor, chunk: int, overlap: int) -> Tensor:
+        image = torch.jit.annotate(Every, every)[0]
+        height, rows = image.size(-2), max(1, chunk // max(int(numbers) * image.size(-1), 1))
+        made = step(every, 0 * numbers, 0 * numbers + min(rows, height))
+        parts = [made[..., :-overlap, :]]
+        last = made[..., -overlap:, :]
+        for first in range(rows, height, rows):
+            made = step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height))
+            made = torch.cat([both(made[..., :overlap, :], last), made[..., overlap:, :]], -2)
+            parts.append(made[..., :-overlap, :])
             last = made[..., -overlap:, :]
-            for first in range(rows, height, rows):
-                made = step(every, 0 * numbers + first, 0 * numbers + min(first + rows, height))
-                made = torch.cat([both(made[..., :overlap, :], last), made[..., overlap:, :]], -2)
-                parts.append(made[..., :-overlap, :])
-                last = made[..., -overlap:, :]
-            parts.append(last)
-            return torch.cat(parts, -2)
+        parts.append(last)
+        return torch.cat(parts, -2)
 
-        return torch.jit.script(loop)
-
-    return _outside(record)(every, _counted(numbers), CHUNK, 2 * reach)
+    return torch.jit.script(loop)
 
 
 def _tuple_of(tensors: Sequence[Tensor]) -> Any:

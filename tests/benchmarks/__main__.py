@@ -24,7 +24,7 @@ MODULES = (
     *("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality"),
     *("rendering", "procedural"),
     *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "stills_quality"),
-    *("splat", "per_sample", "stages", "per_sample_quality"),
+    *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
     *("nfor", "nfor_growth", "nlm", "classical_quality", "flicker"),
 )
 RESULTS = Path("bench") / "results.json"

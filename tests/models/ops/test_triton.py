@@ -62,12 +62,8 @@ def same(found: Tensor | None, expected: Tensor | None) -> None:
 
 
 @pytest.mark.parametrize(("shift", "size", "beyond"), [(s, 3, False) for s in SHIFTS] + [("target", 5, True)])
-def test_it_equals_the_plain_form(
-    shift: str, size: int, beyond: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_equals_the_plain_form(shift: str, size: int, beyond: bool) -> None:
     if LINUX or find_spec("triton") is not None:
-        if DEVICE == "cpu":  # read when the kernels are first imported
-            monkeypatch.setenv("TRITON_INTERPRET", "1")
         compare(shift, size, beyond)
 
 
