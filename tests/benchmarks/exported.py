@@ -3,8 +3,8 @@
     python -m tests.benchmarks.exported [--width 16] [--kernel 11] [--size 256] [--samples 8 32]
 
 Every figure is the growth of a process's peak resident memory in one call, after a small one. It must stay
-below what the file declares (`bytes_per_pixel`, `bytes_once`), from which tiles are cut, whatever the number of
-samples. Needs Linux, which lets a process reset its peak.
+below what the file declares (`bytes_per_pixel`, `bytes_once`), from which tiles are cut, whatever the number
+of samples. Needs Linux, which lets a process reset its peak.
 """
 
 from __future__ import annotations

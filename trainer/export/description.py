@@ -26,8 +26,8 @@ DEFAULTS: dict[str, tuple[float, ...]] = {
 
 
 _MORE_MEMORY = 1.5
-"""Working memory of an exported file beside that of its denoiser. For Layer at 256x256, whether 8 or 32 samples,
-ONNX Runtime was measured to take 1.2 times as much per pixel and TorchScript 1.4 times; 1.6 times for WSKP."""
+"""Working memory of an exported file beside that of its denoiser. For Layer at 256x256, with 8 or 32 samples,
+ONNX Runtime was measured to take 1.2 times as much per pixel and TorchScript 1.4; for WSKP 1.6 times."""
 
 
 @dataclass(frozen=True)
