@@ -65,7 +65,7 @@ _ROWS = 1 << 22
 
 
 class Frame(NamedTuple):
-    """Samples (B, S, C, H, W) on the grid of the U-Nets; exposure, largest depth (B, 1, 1, 1), camera."""
+    """Samples (B, S, C, H, W); exposure, largest depth (B, 1, 1, 1), camera."""
 
     samples: Tensor
     exposure: Tensor
@@ -200,11 +200,8 @@ class SBMC(Denoiser):
         return made
 
     def _frame(self, buffers: Buffers) -> Frame:
-        _, height, width = self.check(buffers)
+        self.check(buffers)
         samples = buffers[SAMPLES]
-        bottom, right = -height % self.multiple, -width % self.multiple
-        if exporting() or bottom or right:  # no number: pixels without samples
-            samples = F.pad(samples, (0, right, 0, bottom), value=torch.nan)
         like = wide(samples[:, 0, :1])
         largest = torch.ones_like(like[:, :, :1, :1])
         if self.depth == "relative" and "depth" in self.samples:
@@ -248,11 +245,20 @@ class SBMC(Denoiser):
             return total / seen.counts.sum(1).clamp_min(1.0)
 
         batch, count = frame.samples.shape[:2]
+        height, width = frame.samples.shape[-2:]
         for step, unet in enumerate(self.unets):
             numbers = batch * count * (frame.samples.shape[2] + 2 * self.width * (step + 1))
             tensors = [frame.samples, *contexts]
-            contexts.append(unet(streamed(mean, tensors, numbers, self.recompute, frame.numbers)))
+            made = streamed(mean, tensors, numbers, self.recompute, frame.numbers)
+            contexts.append(unet(self._padded(made))[..., :height, :width])
         return contexts
+
+    def _padded(self, maps: Tensor) -> Tensor:
+        """Return maps (…, H, W) padded to the grid of the U-Nets by zeros, as pixels without samples have."""
+        bottom, right = (-side % self.multiple for side in maps.shape[-2:])
+        if exporting() or bottom or right:
+            return F.pad(maps, (0, right, 0, bottom))
+        return maps
 
     def _filtered(self, frame: Frame, buffers: Buffers) -> Tensor:
         """Return exposed radiance (B, 3, H, W)."""
@@ -283,6 +289,7 @@ class SBMC(Denoiser):
         inside = Arrivals(*(image[..., reach : reach + height, :] for image in sums))
         if self.outside == "drop":
             return inside
+        inside = Arrivals(*(self._padded(image) for image in inside))  # the grid's pixels are not outside
         return with_outside(inside, self.kernel_size, 1 if self.average else frame.samples.shape[1])
 
     def _gathered(self, frame: Frame, contexts: list[Tensor]) -> Arrivals:
