@@ -12,6 +12,7 @@ from torch import Tensor
 from data.buffers import SAMPLE_BUFFERS
 from data.dropped import Dropped
 from data.frame import Frame
+from models.denoiser import Denoiser
 from models.layers import Layer
 from models.ops.per_sample import arranged, sample_counts
 from trainer.configs import UsageError
@@ -33,8 +34,9 @@ def sample_tensor(frame: Frame, model: Model) -> Tensor:
         ValueError: The frame keeps no samples apart, or they lack a quantity that the model reads; names it.
     """
     if frame.samples is None:
+        name = type(model).__name__ if isinstance(model, Denoiser) else model.description.model
         raise ValueError(
-            f"{frame.label}: {type(model).__name__} reads the samples of each pixel, which the frame does "
+            f"{frame.label}: {name} reads the samples of each pixel, which the frame does "
             "not keep apart; expected channels such as s00.radiance.R, see trainer render --help"
         )
     values = torch.from_numpy(frame.samples.values).permute(0, 3, 1, 2)[None]

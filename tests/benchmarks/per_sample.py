@@ -42,7 +42,7 @@ NETWORKS = ("PixelGather", "SampleSplat", "Layer", "Optimized")
 COUNTS = (2, 4, 8, 16, 32)
 SIDE, WARM, THREADS = 256, 32, 2
 REPEATS, ENOUGH_S = 3, 8.0
-SLOWLY = 1 / 3
+SLOWLY = 1 / 4
 """Layer's cost of one more sample is at most this share of SampleSplat's: the paper's "modest overhead"."""
 
 

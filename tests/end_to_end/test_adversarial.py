@@ -74,6 +74,7 @@ def one_process(batches):
     return weights | {f"critics.color.{name}": value for name, value in critic.state_dict().items()}
 
 
+@pytest.mark.slow
 def test_two_gloo_processes_end_with_the_weights_of_one_on_the_joint_batches(workplace, cache):
     workplace.trainer(*options(workplace, 1, 3), "--trainer.devices", "2", "--trainer.strategy", "ddp")
     saved = final(workplace)

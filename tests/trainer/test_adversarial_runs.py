@@ -235,6 +235,7 @@ class Fireflies(Synthetic):
         return DataLoader(made, self.batch_size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("net", "rate"),
     [(partial(LogNet, width=8), 3e-3), (partial(AFGSA, width=16, blocks=1, checkpointed=1), 1e-3)],

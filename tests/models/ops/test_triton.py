@@ -61,6 +61,7 @@ def same(found: Tensor | None, expected: Tensor | None) -> None:
         close((found.cpu(),), (expected,))
 
 
+@pytest.mark.slow  # the interpreter is
 @pytest.mark.parametrize(("shift", "size", "beyond"), [(s, 3, False) for s in SHIFTS] + [("target", 5, True)])
 def test_it_equals_the_plain_form(shift: str, size: int, beyond: bool) -> None:
     if LINUX or find_spec("triton") is not None:
