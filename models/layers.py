@@ -49,23 +49,20 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from data.buffers import sample_channels
 from models.blocks.layered import Composite, Layered, Sorted, occupancy, smaller
-from models.blocks.per_sample import Frame, PerSample, Seen
+from models.blocks.per_sample import FEATURES, Frame, PerSample
 from models.blocks.pointwise import Pointwise
 from models.blocks.unet import UNet, Upsampling, enlarged
 from models.denoiser import Buffers, Denoised
 from models.ops.boxes import exporting
 from models.ops.outgoing import send
+from models.ops.per_sample import Seen
 from models.ops.precision import wide
 from models.ops.splat import gather_inside, splat_apart, splat_exp
 from models.ops.streaming import scattered, streamed, strip_rows
 
 EPSILON = 1e-6
 """Added to sums of weights before something is divided by them."""
-
-FEATURES = len(sample_channels(*PerSample.samples))
-"""Channels of a sample: 20."""
 
 _LAYER_ORDER = (
     "radiance",
@@ -107,20 +104,6 @@ Compositing = Literal["alpha", "weighted", "printed"]
 class _Sampled(PerSample):
     """What Layer and SampleSplat share: embeddings of samples, and context of their mean."""
 
-    def __init__(
-        self,
-        kernel_size: int,
-        width: int,
-        levels: int,
-        embedding: int,
-        upsampling: Upsampling,
-        recompute: bool,
-        fill: Mapping[str, float] | None,
-    ) -> None:
-        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
-        self.reducer = Pointwise(FEATURES, *[embedding] * 3, linear=False)
-        self.halo = self.unet.halo([kernel_size // 2])
-
     def _embedded(self, seen: Seen) -> Tensor:
         """Return embeddings (B, S, E, H, W)."""
         made = self.reducer(seen.features.flatten(0, 1))
@@ -145,14 +128,7 @@ class Layer(_Sampled):
     Args:
         layers: Layers, from 2 to 5 in the paper; 1 is a splat of pixels.
         compositing: `alpha` front to back; `weighted` sum of layers; `printed`: that as equation 6 stands.
-        kernel_size: Rows and columns of the kernels, odd.
-        width: Channels of the U-Net at full resolution; its other widths and those of the kernel generator
-            follow from it.
-        levels: How often the U-Net halves the resolution.
-        embedding: Channels of an embedding.
-        upsampling: In the U-Net: `nearest` (authors' code) or `bilinear` (paper).
-        recompute: In training, compute what belongs to single samples again in the backward pass.
-        fill: Quantity → the constant that stands for it where samples lack it, such as `{"lens": 0}`.
+        kernel_size, width, levels, embedding, upsampling, recompute, fill: As for `PerSample`.
 
     Attributes:
         aux: Return each layer as `Denoised.aux` (`Layered.named`).
@@ -176,23 +152,20 @@ class Layer(_Sampled):
         recompute: bool = True,
         fill: Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
         if compositing not in ("alpha", "weighted", "printed"):
             raise ValueError(f"compositing {compositing!r}; expected alpha, weighted or printed")
         if not 1 <= layers <= 5:
             raise ValueError(f"layers is {layers}; expected 1 to 5")
         self.layers, self.compositing = layers, compositing
-        self.bytes_per_pixel = max(self.bytes_per_pixel, self._bytes_of_layers())
-        self.partitioner = Pointwise(embedding + self.context, 32, 16, layers, linear=True)
-        self.generator = self._generator()
+        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
 
-    def _bytes_of_layers(self) -> int:
-        """Return the working memory per pixel of layers beside the context: held, joined and splatted."""
-        return 5 * (self.context + self.layers * (2 * self.embedding + 10))
+    def _add_heads(self) -> None:
+        self.partitioner = Pointwise(self.embedding + self.context, 32, 16, self.layers, linear=True)
+        super()._add_heads()
 
-    def _generator(self) -> nn.Module:
-        hidden = 2 * self.width
-        return Pointwise(self.embedding + self.context, hidden, hidden, self.kernel_size**2, linear=True)
+    def _numbers(self) -> int:
+        """Return the larger of the U-Net's and those of layers: held, joined and splatted."""
+        return max(super()._numbers(), self.context + self.layers * (2 * self.embedding + 10))
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Denoiser.forward`.
@@ -283,11 +256,13 @@ class Optimized(Layer):
         width: Half the channels of the context; other widths follow from it.
         levels: How often the U-Net halves the resolution, at least 3.
         narrow_context: Half as many channels of the context at full resolution.
-        embedding, upsampling, recompute, fill: As for `Layer`.
+        embedding, upsampling, recompute, fill: As for `PerSample`.
 
     Raises:
         ValueError: An argument is out of range; the message names it.
     """
+
+    _widths = 4
 
     def __init__(
         self,
@@ -305,13 +280,12 @@ class Optimized(Layer):
             raise ValueError(f"levels is {levels}; Optimized filters on {SCALES} and needs as many")
         self.narrow_context = narrow_context
         super().__init__(layers, "alpha", kernel_size, width, levels, embedding, upsampling, recompute, fill)
+
+    def _halo(self) -> int:
         # An enlarged pixel depends on its neighbour on that level, that on all which reach it, and what these
         # hold on the context of their pixels at full resolution.
-        reach = kernel_size // 2 + 1
-        self.halo = self.unet.halo([reach * 2 ** (SCALES - 1), *[reach] * (SCALES - 1)])
-
-    def _numbers_of_unet(self) -> int:
-        return 4 * self.width + 2 * self.embedding
+        reach = self.kernel_size // 2 + 1
+        return self.unet.halo([reach * 2 ** (SCALES - 1), *[reach] * (SCALES - 1)])
 
     def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
         w = self.width
@@ -345,7 +319,9 @@ class Optimized(Layer):
 
     def _shares(self, embedding: Tensor, context: Tensor) -> Tensor:
         """Return the share of each level in every pixel (B, 3, H, W), from the first layer's generator."""
-        generator, taps = self.generator[0], self.kernel_size**2  # type: ignore[index]
+        assert isinstance(self.generator, nn.ModuleList)
+        generator, taps = self.generator[0], self.kernel_size**2
+        assert isinstance(generator, Pointwise)
 
         def shares(embedding: Tensor, context: Tensor) -> Tensor:
             return torch.softmax(wide(generator.joint(embedding, context)[:, 0, taps:]), 1)
@@ -354,30 +330,11 @@ class Optimized(Layer):
 
 
 class SampleSplat(_Sampled):
-    """A kernel for every sample: the paper's form of Gharbi et al. 2019.
-
-    Args:
-        kernel_size, width, levels, embedding, upsampling, recompute, fill: As for `Layer`.
-
-    Raises:
-        ValueError: An argument is out of range; the message names it.
-    """
+    """A kernel for every sample: the paper's form of Gharbi et al. 2019. Arguments as `PerSample`."""
 
     order = _PIXEL_ORDER
 
-    def __init__(
-        self,
-        kernel_size: int = 17,
-        width: int = 64,
-        levels: int = 5,
-        embedding: int = 32,
-        upsampling: Upsampling = "nearest",
-        recompute: bool = True,
-        fill: Mapping[str, float] | None = None,
-    ) -> None:
-        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
-        hidden = 2 * width
-        self.generator = Pointwise(embedding + self.context, hidden, hidden, kernel_size**2, linear=True)
+    generator: Pointwise
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Layer.forward`."""
@@ -417,33 +374,24 @@ class SampleSplat(_Sampled):
 class PixelGather(PerSample):
     """A kernel for every pixel, from mean and variance of its samples; filters their mean.
 
-    Args:
-        kernel_size, width, levels, embedding, upsampling, recompute, fill: As for `Layer`.
-
-    Raises:
-        ValueError: An argument is out of range; the message names it.
+    Arguments as `PerSample`.
     """
 
     order = _PIXEL_ORDER
 
-    def __init__(
-        self,
-        kernel_size: int = 17,
-        width: int = 64,
-        levels: int = 5,
-        embedding: int = 32,
-        upsampling: Upsampling = "nearest",
-        recompute: bool = True,
-        fill: Mapping[str, float] | None = None,
-    ) -> None:
-        super().__init__(kernel_size, width, levels, embedding, upsampling, recompute, fill)
-        hidden = 2 * width
-        self.reducer = Pointwise(2 * FEATURES, *[embedding] * 3, linear=False)
-        self.generator = Pointwise(embedding + self.context, hidden, hidden, kernel_size**2, linear=True)
-        self.halo = max(self.unet.halo([0]), kernel_size // 2)
-        # All logits and what becomes of them at once: measured 8530 at 256x256 with 17x17 kernels.
-        self.exported_bytes_per_pixel = 32 * kernel_size**2
-        self.bytes_per_pixel = max(self.bytes_per_pixel, 5 * (kernel_size**2 + 3 * embedding + self.context))
+    reads = 2 * FEATURES
+    generator: Pointwise
+
+    def _halo(self) -> int:
+        return max(self.unet.halo([0]), self.kernel_size // 2)
+
+    def _numbers(self) -> int:
+        return max(super()._numbers(), self.kernel_size**2 + 3 * self.embedding + self.context)
+
+    @property
+    def exported_bytes_per_pixel(self) -> int:  # type: ignore[override]
+        """All logits and what becomes of them at once: measured 8530 at 256x256 with 17x17 kernels."""
+        return 32 * self.kernel_size**2
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Layer.forward`."""

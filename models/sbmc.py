@@ -45,14 +45,14 @@ from torch.utils.checkpoint import checkpoint
 
 from data.buffers import SAMPLES, THIN_LENS, sample_channels
 from models.blocks.multisteps import Chain, Context, NormalisedConv
-from models.blocks.sbmc_features import FEATURE_LIMIT, GROUPS, Seen, averaged, expanded, seen_samples
+from models.blocks.sbmc_features import GROUPS, averaged, expanded, seen_samples
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.arrivals import Arrivals, Outside, gathered, merge, splatted, together, with_outside
 from models.ops.boxes import exporting
 from models.ops.gather import pad_border
 from models.ops.guides import farthest, finite
 from models.ops.loops import overlapped
-from models.ops.per_sample import sample_depths
+from models.ops.per_sample import FEATURE_LIMIT, Seen, sample_depths
 from models.ops.precision import wide
 from models.ops.streaming import streamed
 from models.ops.tonemap import exposed

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from models.blocks.pointwise import mixed
+from models.blocks.pointwise import mixed, mixed_jointly
 from models.ops.precision import wide
 
 SLOPE = 0.01
@@ -30,7 +30,7 @@ class Chain(nn.Module):
         )
 
     def forward(self, own: Tensor, shared: Tensor | None) -> Tensor:
-        """Return the output for the input [own, shared]; what is made of `shared` is computed once for all N.
+        """Return the output for the input [own, shared], which are not joined; see `mixed_jointly`.
 
         Args:
             own: (B, N, C1, H, W), of N samples.
@@ -39,20 +39,16 @@ class Chain(nn.Module):
         Returns:
             (B, N, widths[-1], H, W).
         """
-        batch, _, split = own.shape[:3]
         first, *rest = self.layers
         assert isinstance(first, NormalisedConv)
-        weight = first.kernel()
         if shared is None:
-            maps = mixed(own.flatten(0, 1), weight, first.bias)
+            maps = mixed(own.flatten(0, 1), first.kernel(), first.bias)
         else:
-            common = mixed(shared, weight[:, split:], first.bias)
-            maps = mixed(own.flatten(0, 1), weight[:, :split])
-            maps = (maps.reshape(batch, -1, *maps.shape[1:]) + common[:, None]).flatten(0, 1)
+            maps = mixed_jointly(own, shared, first.kernel(), first.bias)
         for layer in rest:
             assert isinstance(layer, NormalisedConv)
             maps = mixed(F.leaky_relu(maps, self.slope), layer.kernel(), layer.bias)
-        return maps.reshape(batch, -1, *maps.shape[1:])
+        return maps.reshape(own.shape[0], -1, *maps.shape[1:])
 
 
 class Context(nn.Module):

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
-from data.buffers import SAMPLE_BUFFERS, SAMPLES
+from data.buffers import SAMPLE_BUFFERS, SAMPLES, sample_channels
+from models.blocks.pointwise import Pointwise
 from models.blocks.unet import UNet, Upsampling
 from models.denoiser import Buffers, Denoiser
 from models.ops.boxes import exporting
 from models.ops.guides import farthest
-from models.ops.per_sample import known, sample_depths
+from models.ops.per_sample import Seen, known, sample_depths, seen
 from models.ops.precision import wide
 from models.ops.tonemap import exposed, srgb_log
 
 RADIANCE_LIMIT = 65535.0
 """Exposed radiance is clipped to this, as in the authors' code."""
-
-FEATURE_LIMIT = 1000.0
-"""What networks see is clipped to +- this."""
 
 _READ = (
     "radiance",
@@ -36,22 +33,11 @@ _READ = (
     "lens",
     "time",
 )
+FEATURES = len(sample_channels(*_READ))
+"""Channels of a sample: 20."""
+
 _SCALES = {"motion": 1 / 128, "coc": 1 / 2}
 """Pixels to the authors' numbers: device coordinates of a frame of 256 pixels, and a radius."""
-
-
-class Seen(NamedTuple):
-    """Samples as networks see them; those that do not count are 0.
-
-    Attributes:
-        radiance: Exposed linear radiance (B, S, 3, H, W).
-        features: What the sample reducer reads, (B, S, 20, H, W).
-        counts: 1 where a sample counts, otherwise 0, (B, S, 1, H, W).
-    """
-
-    radiance: Tensor
-    features: Tensor
-    counts: Tensor
 
 
 class Frame(NamedTuple):
@@ -72,6 +58,7 @@ class PerSample(Denoiser):
 
     Attributes:
         order: In which the sample reducer reads the quantities.
+        reads: Channels that it reads.
 
     Args:
         kernel_size: Rows and columns of the kernels, odd.
@@ -93,16 +80,18 @@ class PerSample(Denoiser):
     samples = _READ  # as files and shards hold them, so that batches need not be copied
     bytes_once = 1 << 26  # strips of `models.ops.streaming`
     order = _READ
+    reads = FEATURES
+    _widths = 7  # alive in the U-Net at full resolution
 
     def __init__(
         self,
-        kernel_size: int,
-        width: int,
-        levels: int,
-        embedding: int,
-        upsampling: Upsampling,
-        recompute: bool,
-        fill: Mapping[str, float] | None,
+        kernel_size: int = 17,
+        width: int = 64,
+        levels: int = 5,
+        embedding: int = 32,
+        upsampling: Upsampling = "nearest",
+        recompute: bool = True,
+        fill: Mapping[str, float] | None = None,
     ) -> None:
         super().__init__()
         if kernel_size < 3 or kernel_size % 2 == 0:
@@ -120,17 +109,33 @@ class PerSample(Denoiser):
         self.multiple = 2**levels
         self.context = 2 * width
         self.unet = self._unet(levels, upsampling)
-        self.bytes_per_pixel = 5 * self._numbers_of_unet()
+        self.reducer = Pointwise(self.reads, *[embedding] * 3, linear=False)
+        self._add_heads()
+        self.halo = self._halo()
+        self.bytes_per_pixel = 5 * self._numbers()
+
+    def _add_heads(self) -> None:
+        """Make the networks that follow the U-Net."""
+        self.generator: nn.Module = self._generator()
+
+    def _generator(self) -> nn.Module:
+        hidden = 2 * self.width
+        return Pointwise(self.embedding + self.context, hidden, hidden, self.kernel_size**2, linear=True)
+
+    def _halo(self) -> int:
+        return self.unet.halo([self.kernel_size // 2])
+
+    def _numbers(self) -> int:
+        """Return the numbers per pixel that are alive at once, at most; those of strips do not count.
+
+        Bytes are five times as many, with what convolutions take for themselves.
+        """
+        return self._widths * self.width + 2 * self.embedding
 
     def _unet(self, levels: int, upsampling: Upsampling) -> UNet:
         w = self.width
         encoder, decoder = (2 * w, 4 * w, 8 * w, 8 * w), (8 * w, 4 * w, 2 * w, 2 * w, 2 * w)
         return UNet(self.embedding, w, encoder[: levels - 1], decoder[-levels:], self.context, upsampling)
-
-    def _numbers_of_unet(self) -> int:
-        """Return the numbers per pixel that are alive at full resolution, at most: bytes are 5 times as many
-        with what convolutions take for themselves."""
-        return 7 * self.width + 2 * self.embedding
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of the samples of whole frames."""
@@ -153,9 +158,7 @@ class PerSample(Denoiser):
         radiance = exposed(parts["radiance"], frame.exposure[:, None]).clamp_max(RADIANCE_LIMIT)
         parts["radiance"] = srgb_log(radiance)
         parts["depth"] = parts["depth"] / frame.farthest[:, None]
-        features = torch.cat([parts[name] for name in self.order], 2).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
-        weight = counts.to(radiance.dtype)
-        return Seen(radiance * weight, features * weight, weight)
+        return seen(radiance, [parts[name] for name in self.order], counts)
 
     def _padded(self, maps: Tensor) -> Tensor:
         """Return maps (…, H, W) padded to the grid of the U-Net by zeros, as pixels without samples have."""

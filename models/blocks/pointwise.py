@@ -33,9 +33,7 @@ class Pointwise(nn.Module):
         return self._rest(mixed(maps, self.first.weight, self.first.bias))
 
     def joint(self, own: Tensor, shared: Tensor) -> Tensor:
-        """Return what comes of [own, shared] without joining them.
-
-        The first convolution is linear in both: what it makes of `shared` is computed once for all N.
+        """Return what comes of [own, shared] without joining them; see `mixed_jointly`.
 
         Args:
             own: (B, N, C1, H, W), of N samples or layers.
@@ -44,13 +42,8 @@ class Pointwise(nn.Module):
         Returns:
             (B, N, widths[-1], H, W).
         """
-        batch, _, split, height, width = own.shape
-        weight = self.first.weight
-        common = mixed(shared, weight[:, split:], self.first.bias)
-        maps = mixed(own.reshape(-1, split, height, width), weight[:, :split])
-        maps = maps.reshape(batch, -1, *common.shape[1:]) + common[:, None]
-        maps = self._rest(maps.flatten(0, 1))
-        return maps.reshape(batch, -1, *maps.shape[1:])
+        maps = self._rest(mixed_jointly(own, shared, self.first.weight, self.first.bias))
+        return maps.reshape(own.shape[0], -1, *maps.shape[1:])
 
     def _rest(self, maps: Tensor) -> Tensor:
         for layer in self.others:
@@ -71,6 +64,26 @@ def mixed(maps: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     if bias is not None:
         made.add_(bias[:, None])
     return made.unflatten(2, maps.shape[2:])
+
+
+def mixed_jointly(own: Tensor, shared: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Return the 1x1 convolution of [own, shared] without joining them.
+
+    It is linear in both: what it makes of `shared` is computed once for all N.
+
+    Args:
+        own: (B, N, C1, H, W), of N samples or layers.
+        shared: (B, C2, H, W) or (B, C2, 1, 1).
+        weight: (C', C1 + C2, 1, 1).
+        bias: (C',).
+
+    Returns:
+        (B * N, C', H, W).
+    """
+    batch, _, split = own.shape[:3]
+    common = mixed(shared, weight[:, split:], bias)
+    maps = mixed(own.flatten(0, 1), weight[:, :split])
+    return (maps.reshape(batch, -1, *maps.shape[1:]) + common[:, None]).flatten(0, 1)
 
 
 def convolution(before: int, after: int, size: int) -> nn.Conv2d:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from data.buffers import SAMPLE_BUFFERS
-from models.ops.per_sample import known
+from models.ops.per_sample import Seen, known, seen
 from models.ops.precision import wide
 from models.ops.tonemap import exposed
 
@@ -26,24 +25,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """The published features: 5, 6, 16, 24, 12 and 30 channels."""
 
-FEATURE_LIMIT = 1000.0
-"""What the network sees is clipped to +- this."""
-
 _LIGHT = ("radiance", "diffuse", "specular")
-
-
-class Seen(NamedTuple):
-    """Samples as the network sees them; those that do not count are 0.
-
-    Attributes:
-        radiance: Exposed linear radiance (B, S, 3, H, W).
-        features: What the first embedding reads, (B, S, C, H, W).
-        counts: 1 where a sample counts, otherwise 0, (B, S, 1, H, W).
-    """
-
-    radiance: Tensor
-    features: Tensor
-    counts: Tensor
 
 
 def seen_samples(samples: Tensor, names: Sequence[str], exposure: Tensor, farthest: Tensor) -> Seen:
@@ -70,9 +52,7 @@ def seen_samples(samples: Tensor, names: Sequence[str], exposure: Tensor, farthe
         radiance, specular = parts["diffuse"] + parts["specular"], parts["specular"]
         parts |= {"diffuse": torch.log1p(radiance) / 10, "specular": torch.log1p(specular) / 10}
     parts |= {n: parts[n] / farthest[:, None] for n in ("depth", "first_depth") if n in parts}
-    features = torch.cat([parts[name] for name in names], 2).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
-    weight = counts.to(radiance.dtype)
-    return Seen(radiance * weight, features * weight, weight)
+    return seen(radiance, [parts[name] for name in names], counts)
 
 
 def averaged(seen: Seen) -> Seen:

@@ -7,6 +7,7 @@ dropped, pixel by pixel. So a pixel may have fewer samples than the frame, or no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -76,6 +77,37 @@ def check_samples(samples: Tensor, channels: Sequence[str], reader: str) -> tupl
     return shape[1], shape[2]
 
 
+FEATURE_LIMIT = 1000.0
+"""What networks see is clipped to +- this."""
+
+
+class Seen(NamedTuple):
+    """Samples as networks see them; those that do not count are 0.
+
+    Attributes:
+        radiance: Exposed linear radiance (B, S, 3, H, W).
+        features: What a network reads, (B, S, C, H, W).
+        counts: 1 where a sample counts, otherwise 0, (B, S, 1, H, W).
+    """
+
+    radiance: Tensor
+    features: Tensor
+    counts: Tensor
+
+
+def seen(radiance: Tensor, features: Sequence[Tensor], counts: Tensor) -> Seen:
+    """Return samples with clipped features, and 0 where a sample does not count.
+
+    Args:
+        radiance: Exposed linear radiance (B, S, 3, H, W).
+        features: (B, S, C, H, W) each, in the order in which a network reads them.
+        counts: Which samples count, bool (B, S, 1, H, W).
+    """
+    clipped = torch.cat(list(features), 2).clamp(-FEATURE_LIMIT, FEATURE_LIMIT)
+    weight = counts.to(radiance.dtype)
+    return Seen(radiance * weight, clipped * weight, weight)
+
+
 def known(samples: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return samples with 0 for all that is not finite, and which of them count, bool (B, S, 1, H, W).
 
@@ -85,6 +117,9 @@ def known(samples: Tensor, names: Sequence[str]) -> tuple[Tensor, Tensor]:
         samples: (B, S, C, H, W), raw.
         names: What the C channels are: quantities in order.
     """
+    # A sum tells in a fraction of the time that nothing is to be done. Other devices would be waited for.
+    if not exporting() and samples.device.type == "cpu" and bool(samples.sum().isfinite()):
+        return samples, torch.ones_like(samples[:, :, :1], dtype=torch.bool)
     far = [channel.partition(".")[0] in MAY_BE_INFINITE for channel in sample_channels(*names)]
     if any(far):
         # Not torch.tensor: recorded graphs would hold the device on which they were recorded.

@@ -75,11 +75,11 @@ def splat_exp(
     Raises:
         ValueError: As for `splat`, or the shift has another shape.
     """
-    if shift is None and not exporting():
+    if shift is not None:
+        return _splatted(values, logits, _Shifts(shift), size, beyond)
+    if not exporting():
         _check(values, logits, size)
-        return _splatted(values, logits, _largest(logits.detach(), size), size, beyond)
-    shift = source_maximum(logits) if shift is None else shift
-    return _splatted(values, logits, _Shifts(shift), size, beyond)
+    return _splatted(values, logits, _own_shifts(logits, size), size, beyond)
 
 
 def splat_apart(values: Tensor, logits: Tensor, size: int, beyond: bool = False) -> Tensor:
@@ -99,11 +99,9 @@ def splat_apart(values: Tensor, logits: Tensor, size: int, beyond: bool = False)
     Raises:
         ValueError: As for `splat`.
     """
-    if exporting():
-        largest = _Shifts(source_maximum(logits))
-    else:
+    if not exporting():
         _check(values, logits, size)
-        largest = _largest(logits.detach(), size)
+    largest = _own_shifts(logits, size)
     assert largest.source is not None
     source = largest.source.expand(values[:, :, :1].shape)
     each = (part.flatten(0, 1)[:, None] for part in (values, logits, source))
@@ -223,11 +221,14 @@ def _splatted(values: Tensor, numbers: Tensor, shifts: _Shifts, size: int, beyon
     return Splatted(sums[:, :-1], sums[:, -1:])
 
 
-def _largest(logits: Tensor, size: int) -> _Shifts:
-    """Return `source_maximum` and which logit it is, (B, 1, H, W).
+def _own_shifts(logits: Tensor, size: int) -> _Shifts:
+    """Return `source_maximum`, and for a gradient which logit it is, (B, 1, H, W).
 
     The largest of each row of taps first: finding places costs 40 times as much as finding values.
     """
+    if exporting() or not (torch.is_grad_enabled() and logits.requires_grad):
+        return _Shifts(source_maximum(logits))
+    logits = logits.detach()
     lines = logits.reshape(len(logits), -1, size, *logits.shape[3:])
     largest, line = lines.amax(2).max(1, keepdim=True)
     taps = torch.gather(lines, 1, line[:, :, None].expand(-1, -1, size, -1, -1))[:, 0]

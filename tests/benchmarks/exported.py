@@ -10,7 +10,6 @@ of samples. Needs Linux, which lets a process reset its peak.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import os
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.timing import Row, print_table, row
 
 METHODS = ("Layer", "SampleSplat", "PixelGather", "Optimized", "SBMC")
@@ -40,12 +40,6 @@ def network(name: str, width: int, kernel: int) -> Any:
     return getattr(models, name)(**arguments).eval()
 
 
-def status(field: str) -> int:
-    """Return a field of this process's status in bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(field + ":"))
-
-
 def child(path: str, side: int, count: int) -> int:
     """Return by how many bytes resident memory grows while a file denoises one image."""
     import torch
@@ -58,9 +52,7 @@ def child(path: str, side: int, count: int) -> int:
     sampled = Sampled(artifact.samples, count)
     artifact(example(artifact.inputs, 1, 32, 32, samples=Sampled(artifact.samples, 2)))
     buffers = example(artifact.inputs, 1, side, side, samples=sampled)
-    ctypes.CDLL(None).malloc_trim(0)
-    before = status("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")
+    before = reset_peak()
     artifact(buffers)
     return status("VmHWM") - before
 

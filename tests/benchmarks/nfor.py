@@ -14,14 +14,11 @@ of its time. The form without compiled kernels (PyTorch) runs on a smaller frame
 from __future__ import annotations
 
 import argparse
-import ctypes
-import gc
 import json
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -31,6 +28,7 @@ from torch import Tensor
 from models import NFOR
 from models.ops import fused
 from tests.benchmarks import arithmetic
+from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.mosaic import mosaic
 from tests.benchmarks.timing import Row, print_table, row
 from tests.models.frames import largest_relative
@@ -84,27 +82,13 @@ def measure(height: int, width: int, window: int, features: tuple[str, ...]) -> 
         net(mosaic(64, 64, net.inputs))
         before = psutil.Process().memory_info().rss
         frame = mosaic(height, width, net.inputs)
-        reset_peak()
-        loaded = psutil.Process().memory_info().rss
+        loaded = reset_peak()
         steps = timed_steps(window)
         wall, processor = time.perf_counter(), time.process_time()
         net(frame)
         wall, processor = time.perf_counter() - wall, time.process_time() - processor
-    bytes_ = {"before": before, "loaded": loaded, "peak": peak_since_reset()}
+    bytes_ = {"before": before, "loaded": loaded, "peak": status("VmHWM")}
     return {"wall": wall, "processor": processor, "bytes": bytes_, "steps": steps}
-
-
-def reset_peak() -> None:
-    """Give free memory back and let Linux count the peak of resident memory from here on."""
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_since_reset() -> int:
-    """Return the peak of resident memory in bytes."""
-    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM:"))
-    return int(line.split()[1]) * 1024
 
 
 def measured(size: tuple[int, int], window: int = 9, features: tuple[str, ...] = FEATURES) -> dict[str, Any]:
