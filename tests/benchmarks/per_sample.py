@@ -1,8 +1,9 @@
 """Figure 2 of the per-sample methods: time, multiply-adds and memory against samples per pixel.
 
-The full networks of Munkberg and Hasselgren 2020 with random weights denoise one 256x256 image, untiled, each
-number of samples in a process of its own on two threads: least time of up to three calls; peak resident set
-during the calls less the resident set before it (loaded code, weights and samples are there already).
+The full networks of Munkberg and Hasselgren 2020 with random weights denoise one 256x256 image, untiled, on two
+threads. Times are medians of calls that take turns in one process, so that all suffer alike from what else a
+machine does. Memory is the peak resident set during a call less the resident set before it (loaded code,
+weights and samples are there already), each in a process of its own.
 
 Multiply-adds are those of the published formulas, as in figure 10 of the paper: what a convolution's weights
 multiply, on [embedding, context] for every sample, layer or pixel that has a kernel, and for a filter one per
@@ -23,8 +24,8 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,13 +36,13 @@ import models
 from models.blocks.per_sample import PerSample
 from models.layers import SCALES, Layer, Optimized, PixelGather, SampleSplat
 from tests.benchmarks.inference import reset_peak, status
-from tests.benchmarks.timing import Row, print_table, row
+from tests.benchmarks.timing import Row, medians, print_table, row
 from tests.models.frames import random_samples
 
 NETWORKS = ("PixelGather", "SampleSplat", "Layer", "Optimized")
 COUNTS = (2, 4, 8, 16, 32)
 SIDE, WARM, THREADS = 256, 32, 2
-REPEATS, ENOUGH_S = 3, 8.0
+REPEATS = 3
 SLOWLY = 1 / 4
 """Layer's cost of one more sample is at most this share of SampleSplat's: the paper's "modest overhead"."""
 
@@ -82,42 +83,55 @@ def _weights(part: torch.nn.Module) -> int:
     return sum(p.numel() for p in part.parameters() if p.ndim > 1)
 
 
-def child(name: str, spp: int, side: int) -> Cost:
-    """Denoise an image and measure; runs in its own process."""
+def network(name: str) -> PerSample:
+    """Return a full network for inference."""
     torch.manual_seed(0)
-    net: PerSample = getattr(models, name)().eval().requires_grad_(False)
+    made: PerSample = getattr(models, name)().eval().requires_grad_(False)
+    return made
+
+
+def cost(name: str, spp: int, side: int) -> tuple[float, float, float]:
+    """Return memory and both counts of multiply-adds of one image; runs in a process of its own."""
+    net = network(name)
     samples, small = (random_samples(1, spp, s, s) for s in (side, WARM))
-    times: list[float] = []
     with torch.inference_mode():
         net({"samples": small})  # threads and code are loaded; the image's memory is not
         with FlopCounterMode(display=False) as counter:
             net({"samples": small})
         before = reset_peak()
-        while len(times) < REPEATS and sum(times) < ENOUGH_S:
-            began = time.perf_counter()
-            net({"samples": samples})
-            times.append(time.perf_counter() - began)
+        net({"samples": samples})
         memory = status("VmHWM") - before
-    pixels = side**2
-    return Cost(
-        min(times), memory, per_pixel(net, spp) * pixels, counter.get_total_flops() / 2 / WARM**2 * pixels
-    )
+    return memory, per_pixel(net, spp) * side**2, counter.get_total_flops() / 2 / WARM**2 * side**2
+
+
+@torch.inference_mode()
+def times(side: int) -> list[float]:
+    """Return the seconds of all networks with all numbers of samples, in turns; runs in its own process."""
+    nets = {name: network(name) for name in NETWORKS}
+    samples = random_samples(1, max(COUNTS), side, side)
+    calls = {
+        f"{name} {spp}": partial(net, {"samples": samples[:, :spp].contiguous()})
+        for name, net in nets.items()
+        for spp in COUNTS
+    }
+    return list(medians(calls, dict.fromkeys(calls, REPEATS)).values())
 
 
 def measured(side: int = SIDE) -> Costs:
     """Measure all networks with all numbers of samples."""
-    found: dict[str, dict[int, Cost]] = {}
+    seconds = iter(_child(side))
+    return {name: {spp: Cost(next(seconds), *_child(side, name, spp)) for spp in COUNTS} for name in NETWORKS}
+
+
+def _child(side: int, *network: str | int) -> list[float]:
+    """Return `cost` of a network and a number of samples, or without these all `times`."""
+    command = [sys.executable, "-m", "tests.benchmarks.per_sample", "--side", str(side)]
+    command += ["--child", *map(str, network)]
     waiting = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}  # as the trainer command has it
-    for name in NETWORKS:
-        found[name] = {}
-        for spp in COUNTS:
-            command = [sys.executable, "-m", "tests.benchmarks.per_sample", "--child", name, str(spp)]
-            done = subprocess.run(
-                [*command, "--side", str(side)], capture_output=True, text=True, check=False, env=waiting
-            )
-            if done.returncode != 0:
-                raise RuntimeError(f"{name}, {spp} spp: {done.stderr.strip()[-500:]}")
-            found[name][spp] = Cost(*json.loads(done.stdout.splitlines()[-1]))
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=waiting)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)}: {done.stderr.strip()[-500:]}")
+    found: list[float] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
@@ -200,10 +214,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--side", type=int, default=SIDE, help="rows and columns; fewer for a quick look")
     parser.add_argument("--picture", type=Path, help="draw costs over samples per pixel")
-    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--child", nargs="*", help=argparse.SUPPRESS)
     options = parser.parse_args()
     torch.set_num_threads(THREADS)
     if options.child:
-        print(json.dumps(child(options.child[0], int(options.child[1]), options.side)))
+        print(json.dumps(cost(options.child[0], int(options.child[1]), options.side)))
+    elif options.child is not None:
+        print(json.dumps(times(options.side)))
     else:
         print_table(run(options.picture, options.side))
