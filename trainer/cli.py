@@ -26,6 +26,10 @@ COMMANDS = {
     "export": "write a trained denoiser as ONNX or TorchScript",
     "models": "list denoisers, their options, and registered models",
     "upload": "send a run that was tracked locally to a tracking server",
+    "sync": "send to the tracking server what a run could not deliver yet",
+    "submit": "run a training, or many independent jobs, on a Ray cluster",
+    "tune": "search hyper-parameters with Ray Tune",
+    "serve": "denoise over HTTP",
 }
 
 # Failures of the surroundings (device, tracking store) that libraries report with classes of their own. They

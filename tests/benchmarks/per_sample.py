@@ -1,9 +1,9 @@
 """Figure 2 of the per-sample methods: time, multiply-adds and memory against samples per pixel.
 
-The full networks of Munkberg and Hasselgren 2020 with random weights denoise one 256x256 image, untiled, on two
-threads. Times are medians of calls that take turns in one process, so that all suffer alike from what else a
-machine does. Memory is the peak resident set during a call less the resident set before it (loaded code,
-weights and samples are there already), each in a process of its own.
+The full networks of Munkberg and Hasselgren 2020 with random weights denoise one 256x256 image, untiled, on
+two threads. Times are medians of calls that take turns in one process, so that all suffer alike from whatever
+else a machine does. Memory is the peak resident set during a call less the resident set before it (loaded
+code, weights and samples are there already), each in a process of its own.
 
 Multiply-adds are those of the published formulas, as in figure 10 of the paper: what a convolution's weights
 multiply, on [embedding, context] for every sample, layer or pixel that has a kernel, and for a filter one per
