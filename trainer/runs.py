@@ -4,6 +4,9 @@
     runs/artifacts/                      its artifacts
     runs/<experiment>/<run name>/        one run: run.json, config.yaml, checkpoints/, export/, pictures/
 
+A launch is what restarts a training that was killed: `torchrun --max-restarts`, a Ray job, a Slurm job that is
+requeued. The run that it trains says so in `launch.json`, so that a restart finds it again.
+
 This module imports nothing heavy.
 """
 
@@ -11,11 +14,15 @@ from __future__ import annotations
 
 import json
 import os
+import socket
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
 RUN_FILE = "run.json"
+LAUNCH_FILE = "launch.json"
+LAUNCH_VARIABLE = "PENUMBRA_LAUNCH"
 
 
 @dataclass
@@ -41,9 +48,7 @@ class RunRecord:
     def save(self, folder: Path) -> None:
         """Write the record whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
-        partial = folder / f".{RUN_FILE}.{os.getpid()}.tmp"
-        partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
-        os.replace(partial, folder / RUN_FILE)
+        _write(folder / RUN_FILE, asdict(self))
 
     @classmethod
     def load(cls, folder: Path) -> RunRecord:
@@ -118,3 +123,82 @@ def folder_of_checkpoint(checkpoint: Path) -> Path | None:
         if (folder / RUN_FILE).is_file():
             return folder
     return None
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What started this process and starts it again when it is killed.
+
+    Attributes:
+        identity: The same in every process and after every restart.
+        restarts: Whether this is a restart, as far as that can be told.
+        unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is a
+            restart: who names a launch means that.
+    """
+
+    identity: str
+    restarts: bool = False
+    unfinished: bool = False
+
+
+def current_launch(environment: Mapping[str, str] = os.environ) -> Launch | None:
+    """Return the launch that this process belongs to, None if nothing would restart it.
+
+    `PENUMBRA_LAUNCH` names one; otherwise torchrun's `--rdzv-id`, or on one machine its process; otherwise the
+    job of Slurm.
+    """
+    named = environment.get(LAUNCH_VARIABLE)
+    if named:
+        return Launch(named, unfinished=True)
+    restarts = environment.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+    torchrun = environment.get("TORCHELASTIC_RUN_ID")
+    if torchrun and torchrun != "none":  # its default
+        return Launch(f"torchrun {torchrun}", restarts, unfinished=True)
+    if torchrun and environment.get("WORLD_SIZE") == environment.get("LOCAL_WORLD_SIZE"):
+        import psutil
+
+        agent = psutil.Process(os.getppid())
+        return Launch(f"torchrun {socket.gethostname()} {agent.pid} {agent.create_time():.2f}", restarts)
+    if "SLURM_JOB_ID" in environment:
+        again = environment.get("SLURM_RESTART_COUNT", "0") != "0"
+        return Launch(f"slurm {environment['SLURM_JOB_ID']}", again)
+    return None
+
+
+def begin_launch(folder: Path, launch: Launch) -> None:
+    """Note in a run's folder that a launch trains it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / LAUNCH_FILE, {"launch": launch.identity, "finished": False})
+
+
+def end_launch(folder: Path) -> None:
+    """Note that the launch of a run has nothing left to do, so that it is not continued."""
+    path = folder / LAUNCH_FILE
+    if path.is_file():
+        _write(path, {**_read(path), "finished": True})
+
+
+def run_of_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
+    """Return the run folder that a launch is to go on with, None where it is to begin a new run."""
+    if not (launch.restarts or launch.unfinished):
+        return None
+    for folder in reversed(run_folders(root, experiment)):
+        noted = _read(folder / LAUNCH_FILE)
+        if noted.get("launch") == launch.identity and not noted.get("finished"):
+            return folder
+    return None
+
+
+def _write(path: Path, record: Mapping[str, object]) -> None:
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    partial.write_text(json.dumps(record, indent=1) + "\n")
+    os.replace(partial, path)
+
+
+def _read(path: Path) -> dict[str, object]:
+    """Return what a launch noted; nothing where the file is absent or damaged."""
+    try:
+        record = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}

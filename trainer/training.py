@@ -14,10 +14,12 @@ from typing import Any
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities import rank_zero_only
 
 from models.denoiser import Denoiser
 from trainer import configs, runs
 from trainer.callbacks.recorder import RunRecorder
+from trainer.tracking import MLflowTracking
 
 TRACKING = "trainer.tracking.MLflowTracking"
 TOP_LEVEL = ("model", "data", "trainer", "config", "print_config", "ckpt_path", "seed_everything")
@@ -187,6 +189,8 @@ class TrainingCLI(LightningCLI):
             config.verbose = False
         logger = config.trainer.logger
         tracked = getattr(logger, "class_path", None) == TRACKING
+        if tracked and not evaluation and self._restarted(config, logger.init_args):
+            return
         if config.ckpt_path or evaluation:
             root = Path(logger.init_args.root if tracked else "runs")
             experiment = logger.init_args.experiment if tracked else "penumbra"
@@ -203,6 +207,36 @@ class TrainingCLI(LightningCLI):
             config.trainer.callbacks = [
                 c for c in config.trainer.callbacks or [] if c.class_path.endswith(keep)
             ]
+
+    def _restarted(self, config: Any, logger: Any) -> bool:
+        """Continue the run of this launch where it is a restart; returns whether it is.
+
+        A run that was killed before its first checkpoint starts again in the same folder and MLflow run.
+        """
+        launch = runs.current_launch()
+        folder = launch and runs.run_of_launch(launch, Path(logger.root), logger.experiment)
+        if not folder:
+            return False
+        newest = folder / "checkpoints" / "last.ckpt"
+        config.ckpt_path = str(newest) if newest.is_file() else None
+        logger.resume_from = str(folder)
+        if rank_zero_only.rank == 0:
+            place = f"from {newest}" if config.ckpt_path else "from its beginning, it has no checkpoint yet"
+            print(f"restarted: the run {folder.name} goes on {place}", file=sys.stderr)
+        return True
+
+    def before_fit(self) -> None:
+        """Note in the run's folder which launch trains it."""
+        self.launch = runs.current_launch()
+        logger = self.trainer.logger
+        if self.launch and self.trainer.is_global_zero and isinstance(logger, MLflowTracking):
+            runs.begin_launch(logger.folder, self.launch)
+
+    def after_fit(self) -> None:
+        """Note that the run is complete."""
+        logger = self.trainer.logger
+        if self.launch and self.trainer.is_global_zero and isinstance(logger, MLflowTracking):
+            runs.end_launch(logger.folder)
 
     def instantiate_classes(self) -> None:
         """Build everything, and say early which options of the trainer have no effect."""

@@ -56,12 +56,18 @@ def test_penalty_of_a_flat_critic_is_one_with_a_finite_gradient():
 
 def test_mixing_follows_from_its_key_alone_and_differs_between_keys():
     like = torch.zeros(1000, 3, 2, 2)
-    first = mixing((1, 0, 5, 0, 0), like)
+    first = mixing((1, 0, 5, 0), like)
     assert first.shape == (1000, 1, 1, 1)
-    assert torch.equal(first, mixing((1, 0, 5, 0, 0), like))
+    assert torch.equal(first, mixing((1, 0, 5, 0), like))
     assert 0 <= float(first.min()) < 0.01 < 0.99 < float(first.max()) < 1
-    for other in ((2, 0, 5, 0, 0), (1, 1, 5, 0, 0), (1, 0, 6, 0, 0), (1, 0, 5, 1, 0), (1, 0, 5, 0, 1)):
+    for other in ((2, 0, 5, 0), (1, 1, 5, 0), (1, 0, 6, 0), (1, 0, 5, 1)):
         assert not torch.equal(first, mixing(other, like))
+
+
+def test_mixing_of_the_ranks_is_that_of_one_process_on_the_joint_batch():
+    joint = mixing((1, 0, 5, 0), torch.zeros(12, 3, 2, 2))
+    parts = [mixing((1, 0, 5, 0), torch.zeros(4, 3, 2, 2), rank) for rank in range(3)]
+    assert torch.equal(torch.cat(parts), joint)
 
 
 @pytest.mark.parametrize("count", [1, 5, 6, 7, 12])
@@ -85,7 +91,7 @@ def literal(net, critics, data, first, halved=True, names=("color",)):
         loss = 0
         for index, name in enumerate(names):
             critic, real, fake = critics[name], pairs[name].target, pairs[name].output.detach()
-            u = mixing((1, 0, number, 0, index), real)
+            u = mixing((1, 0, number, index), real)
             between = (fake * u + real * (1 - u)).requires_grad_(True)
             slope = torch.autograd.grad(critic(between), between, torch.ones(len(u)), create_graph=True)[0]
             penalty = ((slope.pow(2).sum((1, 2, 3)).sqrt() - 1) ** 2).mean()
@@ -164,7 +170,7 @@ def test_training_ends_at_max_steps_of_the_denoiser():
 
 
 def test_gradients_of_accumulated_batches_are_those_of_the_joint_batch(monkeypatch):
-    monkeypatch.setattr(adversarial, "mixing", lambda key, like: torch.full((len(like), 1, 1, 1), 0.4))
+    monkeypatch.setattr(adversarial, "mixing", lambda key, like, rank: torch.full((len(like), 1, 1, 1), 0.4))
     joint, parts = module(critic_first=False), module(accumulate=3)
     fit(joint, batch_size=6, count=12)
     fit(parts, batch_size=2, count=12)

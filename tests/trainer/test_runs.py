@@ -1,6 +1,16 @@
 import pytest
 
-from trainer.runs import RunRecord, find_checkpoint, folder_of_checkpoint, new_folder
+from trainer.runs import (
+    Launch,
+    RunRecord,
+    begin_launch,
+    current_launch,
+    end_launch,
+    find_checkpoint,
+    folder_of_checkpoint,
+    new_folder,
+    run_of_launch,
+)
 from trainer.training import evaluated
 
 
@@ -67,3 +77,45 @@ def test_damaged_record_is_named(tmp_path):
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"run\.json is damaged"):
         RunRecord.load(tmp_path)
+
+
+def test_restarted_launch_finds_its_run_and_no_other(tmp_path):
+    mine, other = make_run(tmp_path, "20260101-000000"), make_run(tmp_path, "20260102-000000")
+    begin_launch(mine, Launch("a"))
+    begin_launch(other, Launch("b"))
+    make_run(tmp_path, "20260103-000000")
+    assert run_of_launch(Launch("a", restarts=True), tmp_path, "exp") == mine
+    assert run_of_launch(Launch("a", unfinished=True), tmp_path, "exp") == mine
+    assert run_of_launch(Launch("a"), tmp_path, "exp") is None
+    assert run_of_launch(Launch("c", restarts=True), tmp_path, "exp") is None
+
+
+def test_finished_run_is_not_continued_by_its_launch(tmp_path):
+    folder = make_run(tmp_path, "20260101-000000")
+    begin_launch(folder, Launch("a"))
+    end_launch(folder)
+    assert run_of_launch(Launch("a", restarts=True, unfinished=True), tmp_path, "exp") is None
+
+
+def test_damaged_note_of_a_launch_is_no_launch(tmp_path):
+    folder = make_run(tmp_path, "20260101-000000")
+    (folder / "launch.json").write_text('{"launch"')
+    assert run_of_launch(Launch("a", restarts=True), tmp_path, "exp") is None
+
+
+def test_launch_is_named_by_variable_torchrun_or_slurm():
+    assert current_launch({}) is None
+    assert current_launch({"PENUMBRA_LAUNCH": "x", "SLURM_JOB_ID": "7"}) == Launch("x", unfinished=True)
+    torchrun = {"TORCHELASTIC_RUN_ID": "job", "TORCHELASTIC_RESTART_COUNT": "2"}
+    assert current_launch(torchrun) == Launch("torchrun job", restarts=True, unfinished=True)
+    assert current_launch({"SLURM_JOB_ID": "7"}) == Launch("slurm 7")
+    assert current_launch({"SLURM_JOB_ID": "7", "SLURM_RESTART_COUNT": "1"}) == Launch("slurm 7", True)
+
+
+def test_torchrun_without_an_identity_is_known_by_its_process_on_one_machine_only():
+    one = {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_RESTART_COUNT": "0", "WORLD_SIZE": "2"}
+    launch = current_launch({**one, "LOCAL_WORLD_SIZE": "2"})
+    assert launch == current_launch({**one, "LOCAL_WORLD_SIZE": "2"})
+    assert not launch.restarts
+    assert not launch.unfinished
+    assert current_launch({**one, "LOCAL_WORLD_SIZE": "1"}) is None

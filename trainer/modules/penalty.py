@@ -16,17 +16,20 @@ FLOOR = 1e-12
 """Below the root of the norm, whose derivative at zero would be infinite."""
 
 
-def mixing(key: Sequence[int], like: Tensor) -> Tensor:
+def mixing(key: Sequence[int], like: Tensor, rank: int = 0) -> Tensor:
     """Return one number in [0, 1) per sample, (B, 1, 1, 1), the same whenever the key is the same.
 
-    Numbers follow from the key alone, such as seed, epoch, batch and rank, so a run that was killed draws the
-    same ones without any state in the checkpoint.
+    Numbers follow from the key, such as seed, epoch and batch, and the sample's place in the batches of all
+    ranks put together. So a run that was killed draws the same ones without any state in the checkpoint, and
+    one process draws on joint batches what many draw on theirs.
 
     Args:
         key: Non-negative integers.
         like: Images (B, …), whose device and type the numbers get.
+        rank: Which of the batches it is; all have B images.
     """
-    drawn = np.random.default_rng(list(key)).random(len(like), dtype=np.float32)
+    start = rank * len(like)
+    drawn = np.random.default_rng(list(key)).random(start + len(like), dtype=np.float32)[start:]
     return torch.from_numpy(drawn).to(like).reshape(-1, *[1] * (like.ndim - 1))
 
 

@@ -1,0 +1,88 @@
+"""Trains shipped configurations on two ranks, or in one process on the joint batches; run by torchrun.
+
+    python -m tests.end_to_end.ddp_modules OUTPUT JOBS.json joint
+    torchrun --nproc-per-node 2 -m tests.end_to_end.ddp_modules OUTPUT JOBS.json ranks
+
+JOBS.json: name → arguments of `trainer fit`. Writes `<name>.pt`: weights before and after, validation scores.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+from data import Shards
+from trainer import configs
+from trainer.training import TrainingCLI, quiet_libraries
+
+RANKS = 2
+
+
+class Joint(Shards):
+    """Delivers in one process the batches of all ranks, joined."""
+
+    def train_dataloader(self):
+        loaders = []
+        for rank in range(RANKS):
+            self._place = lambda rank=rank: (rank, RANKS)
+            loaders.append(super().train_dataloader())
+        del self._place
+        return JointLoader(loaders)
+
+
+class JointLoader:
+    """Batches of all ranks, joined."""
+
+    def __init__(self, loaders):
+        self.loaders = loaders
+
+    def __len__(self):
+        return len(self.loaders[0])
+
+    def __iter__(self):
+        return map(joined, zip(*self.loaders, strict=True))
+
+
+def joined(parts):
+    """Return one batch of several."""
+    whole = dict(parts[0])
+    for key, value in parts[0].items():
+        if isinstance(value, torch.Tensor):
+            whole[key] = torch.cat([part[key] for part in parts])
+        elif key != "sample_channels":
+            whole[key] = [item for part in parts for item in part[key]]
+    return whole
+
+
+def weights(cli):
+    return {name: value.detach().clone() for name, value in cli.model.state_dict().items()}
+
+
+class Recorded(TrainingCLI):
+    """Keeps the weights before training."""
+
+    def before_fit(self):
+        super().before_fit()
+        self.before = weights(self)
+
+
+def main():
+    output, jobs, how = Path(sys.argv[1]), json.loads(Path(sys.argv[2]).read_text()), sys.argv[3]
+    quiet_libraries()
+    torch.set_num_threads(1)
+    for name, arguments in jobs.items():
+        if how == "joint":
+            extra = ["--data", f"{__spec__.name}.Joint"]
+        else:
+            extra = ["--trainer.devices", str(RANKS), "--trainer.strategy", "ddp"]
+        sys.argv = ["trainer", *configs.resolve_arguments(arguments), *extra]
+        cli = Recorded()
+        if cli.trainer.is_global_zero:
+            scores = {key: float(value) for key, value in cli.trainer.callback_metrics.items()}
+            saved = {"before": cli.before, "after": weights(cli), "scores": scores}
+            torch.save(saved, output / f"{how}-{name}.pt")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""Every training module, with every network that ships, learns on two ranks what it learns on joint batches."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import trainer.modules
+from tests.configs.test_configs import SAMPLES, TRAINED, arguments
+from trainer import configs
+
+NAMES = [name for name in TRAINED if name not in SAMPLES]
+OVERLAY = """
+model:
+  init_args:
+    optimizer: {class_path: torch.optim.SGD, init_args: {lr: 0.01}}
+    lr_scheduler: null
+trainer: {logger: false, callbacks: [], enable_checkpointing: false, accelerator: cpu}
+"""
+
+
+def job(name, overlay):
+    """Return arguments that train three steps of plain gradient descent and validate two uneven batches."""
+    return [
+        *arguments(name), "--config", str(overlay), "--trainer.limit_train_batches", "3",
+        "--trainer.limit_val_batches", "2", "--trainer.logger", "false", "--trainer.callbacks", "[]",
+        "--data.init_args.sample_counts", "null",  # ranks may draw different numbers
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, cache):
+    """Name of the configuration → how it was trained → weights and scores."""
+    folder = tmp_path_factory.mktemp("modules")
+    (folder / "overlay.yaml").write_text(OVERLAY)
+    jobs = folder / "jobs.json"
+    jobs.write_text(json.dumps({name: job(name, folder / "overlay.yaml") for name in NAMES}))
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
+    environment |= {"OMP_NUM_THREADS": "1", "PENUMBRA_CACHE": str(cache)}
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    script = ["-m", "tests.end_to_end.ddp_modules", str(folder), str(jobs)]
+    for command in ([sys.executable, *script, "joint"], [*torchrun, *script, "ranks"]):
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+        assert done.returncode == 0, done.stderr[-5000:]
+    return {
+        name: {how: torch.load(folder / f"{how}-{name}.pt", weights_only=True) for how in ("joint", "ranks")}
+        for name in NAMES
+    }
+
+
+def test_every_training_module_is_trained():
+    texts = [(configs.folder() / name).read_text() for name in NAMES]
+    for module in trainer.modules.__all__:
+        assert any(f"trainer.modules.{module}\n" in text for text in texts), module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_two_ranks_learn_what_one_process_learns_from_their_joint_batches(name, trained):
+    joint, ranks = trained[name]["joint"], trained[name]["ranks"]
+    moved = 0
+    for key, after in joint["after"].items():
+        before = joint["before"][key]
+        assert torch.equal(before, ranks["before"][key]), key
+        if not after.is_floating_point():
+            continue
+        expected, found = after - before, ranks["after"][key] - before
+        moved += int(expected.abs().max() > 0)
+        # A weight moves by a multiple of its rounding, so small moves are known less exactly.
+        limit = 1e-3 * expected.abs().max() + 4 * torch.finfo(after.dtype).eps * before.abs()
+        assert ((expected - found).abs() <= limit).all(), key
+    assert moved > 0.9 * len(joint["after"])
+    for key, value in joint["scores"].items():
+        if key.startswith("val/"):
+            assert ranks["scores"][key] == pytest.approx(value, rel=1e-3), key
