@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
-import json
-import tarfile
-from collections.abc import Iterable, Mapping, Sequence
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from data import remote
 from data.buffers import BUFFERS, buffer
 from data.buffers import SAMPLES as KEPT_APART
 from data.dropped import Dropped, total
@@ -22,8 +20,11 @@ from data.ingestion import PARTIAL
 from data.layouts import LAYOUTS, layout, likeliest
 from data.layouts.scene import Scene
 from data.manifest import MANIFEST, SPLITS, file_sha256
+from data.root import resolve_root
+from data.shards.cache import ShardCache
+from data.shards.index import INDEX, Index, ShardRecord
+from data.shards.read import ShardReader
 
-INDEX = "index.json"
 SAMPLES = 8
 """Samples of each split whose pixels are looked at."""
 
@@ -165,90 +166,102 @@ def _layout(root: Path, name: str) -> dict[str, Any]:
     }
 
 
+def inspect_url(url: str) -> dict[str, Any]:
+    """Return what was found of shards at a URL, as `inspect_path` does.
+
+    Sizes are compared; checksums of shards only when training downloads them. Samples that are looked at are
+    verified.
+
+    Raises:
+        OSError: The URL cannot be read.
+        ValueError: It holds no shards, or damaged ones.
+    """
+    root = resolve_root(url)
+    assert root.url is not None
+    with tempfile.TemporaryDirectory(prefix="penumbra-") as folder:
+        index = Index.read_remote(root.url, Path(folder))
+        sizes = remote.listing(root.url)
+        problems = {shard.file: _remote_problem(index, shard, sizes) for shard in index.shards}
+        return {**_described(index, problems), "checked": "sizes"}
+
+
 def _shards(root: Path) -> dict[str, Any]:
-    try:
-        index = json.loads((root / INDEX).read_text(encoding="utf-8"))
-        if not isinstance(index, dict) or index["format"] != "penumbra-shards":
-            raise ValueError("its `format` is not penumbra-shards")
-        shards = index["shards"]
-        found = {s["file"]: _shard_problem(root, s) for s in shards}
-        splits = {split: [s for s in shards if s["split"] == split] for split in SPLITS}
-        return {
-            "kind": "shards",
-            "path": str(root),
-            "manifest_hash": index["manifest_hash"],
-            "options": index["options"],
-            "problems": [p for p in found.values() if p],
-            "splits": {
-                name: {
-                    "shards": len(group),
-                    "samples": sum(len(s["samples"]) for s in group),
-                    "bytes": sum(s["bytes"] for s in group),
-                    "buffers": _sampled(root, [s for s in group if not found[s["file"]]]),
-                }
-                for name, group in splits.items()
-            },
-        }
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{root / INDEX} is damaged: {error!s}; run `trainer prepare` again") from error
+    index = Index.read(root, check_sizes=False)
+    problems = {shard.file: _shard_problem(root, shard) for shard in index.shards}
+    return {**_described(index, problems), "checked": "checksums"}
 
 
-def _shard_problem(root: Path, shard: Mapping[str, Any]) -> str | None:
-    path = root / shard["file"]
-    if path.parent != root or path.name in ("", ".."):
-        return f"{root / INDEX} names {shard['file']!r}, which is no file of its folder; the index is damaged"
+def _described(index: Index, problems: Mapping[str, str | None]) -> dict[str, Any]:
+    return {
+        "kind": "shards",
+        "path": index.place,
+        "manifest_hash": index.manifest_hash,
+        "options": index.options,
+        "problems": [p for p in problems.values() if p],
+        "splits": {
+            name: {
+                "shards": len(index.of(name)),
+                "samples": index.count(name),
+                "bytes": sum(s.bytes for s in index.of(name)),
+                "buffers": _sampled(index, name, {file for file, p in problems.items() if p}),
+            }
+            for name in SPLITS
+        },
+    }
+
+
+def _shard_problem(root: Path, shard: ShardRecord) -> str | None:
+    path = root / shard.file
     if not path.is_file():
         return f"{path} is missing; run `trainer prepare` again"
-    if path.stat().st_size != shard["bytes"] or file_sha256(path) != shard["sha256"]:
+    if path.stat().st_size != shard.bytes or file_sha256(path) != shard.sha256:
         return f"{path} does not match its checksum: altered or truncated; run `trainer prepare` again"
     return None
 
 
-def _sampled(root: Path, shards: list[Mapping[str, Any]]) -> dict[str, Any]:
+def _remote_problem(index: Index, shard: ShardRecord, sizes: Mapping[str, int] | None) -> str | None:
+    assert index.url is not None
+    url = remote.join(index.url, shard.file)
+    try:
+        size = remote.size_of(url) if sizes is None else sizes.get(shard.file, -1)
+    except FileNotFoundError:
+        size = -1
+    if size == -1:
+        return f"{remote.shown(url)} is missing; send the shards again: trainer prepare … --force"
+    if size not in (None, shard.bytes):
+        return f"{remote.shown(url)} has {size} bytes, the index says {shard.bytes}: altered or truncated"
+    return None
+
+
+def _sampled(index: Index, split: str, left_out: Set[str]) -> dict[str, Any]:
     """Return statistics over a few samples, evenly spread over whole shards of a split."""
-    places = [(s["file"], p) for s in shards for p in s["samples"]]
-    chosen = places[:: max(1, -(-len(places) // SAMPLES))]
+    cache = None if index.url is None else ShardCache(index, 1 << 50)
+    reader = ShardReader(index, split, cache=cache)
+    numbers = [n for n in range(len(reader)) if reader.shards[reader.locate(n)[0]].file not in left_out]
     found: dict[str, list[dict[str, Any]]] = {}
-    for file, place in chosen:
-        with (root / file).open("rb") as stream:
-            stream.seek(max(place["offset"], 0))
-            data = stream.read(min(place["size"], (root / file).stat().st_size))
-        for name, values in _sample_statistics(data).items():
+    for number in numbers[:: max(1, -(-len(numbers) // SAMPLES))]:
+        for name, values in _sample_statistics(reader, number).items():
             found.setdefault(name, []).append(values)
     return {name: _merge(values) for name, values in found.items()}
 
 
-def _sample_statistics(data: bytes) -> dict[str, dict[str, Any]]:
-    try:
-        with tarfile.open(fileobj=io.BytesIO(data)) as tar:
-            files = [(m.name, tar.extractfile(m)) for m in tar.getmembers() if m.isfile()]
-            members = {Path(name).suffix: file.read() for name, file in files if file is not None}
-        meta, raw = json.loads(members[".json"]), members[".buffers"]
-    except (tarfile.TarError, KeyError) as error:
-        raise ValueError(f"a sample is no pair of .json and .buffers ({error})") from error
+def _sample_statistics(reader: ShardReader, number: int) -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {}
-    for entry in meta["buffers"]:
-        count = int(np.prod(entry["shape"]))
-        array = np.frombuffer(raw, entry["dtype"], count, entry["offset"]).reshape(entry["shape"])
-        result |= _quantities(entry, array) if entry["name"] == KEPT_APART else {}
-        if entry["name"] in BUFFERS:
+    for name in reader.sample(number).buffers:
+        array = reader.array(number, name).numpy()
+        entry = {"type": "half" if array.dtype.itemsize == 2 else "float", "shape": list(array.shape)}
+        if name == KEPT_APART:
+            gone = 100 * float(np.isnan(array).all(1).mean())
+            result[name] = {**entry, "non_finite_percent": gone}
+        elif name in BUFFERS:
             image = np.moveaxis(array, 0, -1).astype(np.float32)
             good = np.isfinite(image).all(-1)
-            result[entry["name"]] = {
-                "type": "half" if array.dtype.itemsize == 2 else "float",
-                "shape": list(entry["shape"]),
-                **(statistics(entry["name"], image[good][None]) if good.any() else {}),
+            result[name] = {
+                **entry,
+                **(statistics(name, image[good][None]) if good.any() else {}),
                 "non_finite_percent": 100 * float(1 - good.mean()),
             }
     return result
-
-
-def _quantities(entry: Mapping[str, Any], array: NDArray[Any]) -> dict[str, dict[str, Any]]:
-    """Return type, shape and the share of dropped samples of samples that are kept apart."""
-    gone = np.isnan(array).all(1)
-    kind = "half" if array.dtype.itemsize == 2 else "float"
-    percent = 100 * float(gone.mean())
-    return {KEPT_APART: {"type": kind, "shape": list(entry["shape"]), "non_finite_percent": percent}}
 
 
 def _merge(values: list[dict[str, Any]]) -> dict[str, Any]:

@@ -12,8 +12,9 @@ from data.buffers import SAMPLES, buffer
 from data.frames import FrameSet
 from data.manifest import load_manifest
 from data.needs import beside, explain_lacking, patch_number
-from data.root import resolve_root
+from data.root import Root, resolve_root
 from data.shards.batch import Batches, available
+from data.shards.cache import ShardCache
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
 from data.shards.options import recipe_options
@@ -35,8 +36,9 @@ class Shards(LightningDataModule):
     epoch. Validation and test read every sample once over all ranks.
 
     Args:
-        root: `sample:NAME`, a folder of shards, or an ingested folder, which is prepared into
-            `$PENUMBRA_CACHE` (default ~/.cache/penumbra) before the first use.
+        root: `sample:NAME`, a folder of shards, the URL of one (`s3://BUCKET/SHARDS`,
+            `https://HOST/SHARDS`), or an ingested folder, which is prepared into `$PENUMBRA_CACHE` (default
+            ~/.cache/penumbra) before the first use.
         batch_size: Samples per batch and rank; test has batches of one frame.
         workers: Processes that read, per rank; 0 reads in the training process.
         seed: Seed of order and augmentation, and of patch positions where the root is prepared here.
@@ -67,6 +69,8 @@ class Shards(LightningDataModule):
         sample_counts: Fewest and most samples per pixel that a training batch keeps, drawn anew for each
             batch, where frames keep samples apart; None: all.
         spp: Use only frames with these samples per pixel, where the root is prepared here; None: all.
+        cache_gb: Where the root is a URL, size of the copies of shards in `$PENUMBRA_CACHE`, for all runs of
+            this machine together. Samples of shards that do not fit are read over the network each time.
 
     Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W), `sample_channels`, a
     list of C names such as `radiance.R`, and `thin_lens` (B, 3), aperture radius, focus distance and field of
@@ -96,13 +100,16 @@ class Shards(LightningDataModule):
         spp: Sequence[int] | None = None,
         targets: Sequence[str] = ("reference",),
         sample_counts: tuple[int, int] | None = None,
+        cache_gb: float = 50.0,
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0:
             raise ValueError(f"batch_size {batch_size} and workers {workers}: expected at least 1 and 0")
         if on_corrupt not in ("raise", "skip"):
             raise ValueError(f"on_corrupt is {on_corrupt!r}; expected 'raise' or 'skip'")
-        self.root = root
+        if not cache_gb > 0:
+            raise ValueError(f"cache_gb is {cache_gb}; expected gigabytes, more than 0")
+        self.root, self.cache_gb = root, cache_gb
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
         self.augmentation = (
             Augmentation(augment_rule, exposure_stops, seed, permute, drop_history, sample_counts)
@@ -128,6 +135,7 @@ class Shards(LightningDataModule):
         # Ranks with an odd sample less have an evaluation batch less, and with few frames none.
         self.allow_zero_length_dataloader_with_multiple_devices = True
         self._index: Index | None = None
+        self._resolved: Root | None = None
         self._loaders: dict[str, Loader] = {}
 
     @property
@@ -136,18 +144,26 @@ class Shards(LightningDataModule):
 
         Raises:
             ValueError: The root is no data set; the message says which command to run.
-            OSError: The root does not exist.
+            OSError: The root does not exist, or is a URL that cannot be read.
         """
         if self._index is None:
-            found = resolve_root(self.root)
+            found = self._find_root()
             path = found.path if found.kind == "shards" else cached_path(found.path, self.options)
-            self._index = Index.read(path, check_sizes=self.on_corrupt == "raise")
+            if found.url is not None:
+                self._index = Index.read_remote(found.url, path)
+            else:
+                self._index = Index.read(path, check_sizes=self.on_corrupt == "raise")
         return self._index
+
+    def _find_root(self) -> Root:
+        if self._resolved is None:
+            self._resolved = resolve_root(self.root)
+        return self._resolved
 
     @property
     def manifest_hash(self) -> str:
         """Hash of the manifest of the frames, the same whether they are prepared yet or not."""
-        found = resolve_root(self.root)
+        found = self._find_root()
         return load_manifest(found.path).hash if found.kind == "frames" else self.index.manifest_hash
 
     def scenes(self, split: str) -> tuple[str, ...]:
@@ -169,7 +185,7 @@ class Shards(LightningDataModule):
         Raises:
             ValueError: A frame lacks a buffer that the network reads or is compared with.
         """
-        found = resolve_root(self.root)
+        found = self._find_root()
         if found.kind == "frames":
             if lacking := FrameSet(found.path).lacking(self.options.buffers):
                 raise ValueError(explain_lacking(self._reader(), found.path, *lacking))
@@ -185,7 +201,7 @@ class Shards(LightningDataModule):
         for split in needed:
             if self.index.count(split) == 0:
                 raise ValueError(
-                    f"{self.index.root} has no samples in split {split!r}; prepare it from frames whose "
+                    f"{self.index.place} has no samples in split {split!r}; prepare it from frames whose "
                     "manifest has a scene for it"
                 )
 
@@ -245,7 +261,9 @@ class Shards(LightningDataModule):
         return self._keep(split, loader)
 
     def _batches(self, split: str, augmentation: Augmentation | None) -> Batches:
-        reader = ShardReader(self.index, split, self.verify)
+        index = self.index
+        cache = None if index.url is None else ShardCache(index, round(self.cache_gb * 1e9))
+        reader = ShardReader(index, split, self.verify, cache)
         names = self._names(reader, evaluation=augmentation is None)
         return Batches(reader, names, self.temporal, self.buffers or (), augmentation, self.on_corrupt)
 
@@ -256,12 +274,12 @@ class Shards(LightningDataModule):
         missing = [name for name in wanted if name not in held]
         if SAMPLES in missing:
             raise ValueError(
-                f"{self.index.root} has no samples of each pixel, which the network reads; render or ingest "
+                f"{self.index.place} has no samples of each pixel, which the network reads; render or ingest "
                 "frames that keep them apart, and prepare those"
             )
         if missing:
             raise ValueError(
-                f"{self.index.root} has no buffer {', '.join(missing)}; its {reader.split} samples hold "
+                f"{self.index.place} has no buffer {', '.join(missing)}; its {reader.split} samples hold "
                 f"{', '.join(sample.buffers)}. Prepare again: trainer prepare FRAMES --output SHARDS "
                 f"--buffers {','.join(missing)}"
             )
@@ -275,7 +293,7 @@ class Shards(LightningDataModule):
             except CorruptSampleError:
                 if self.on_corrupt == "raise":
                     raise
-        raise ValueError(f"{self.index.root} has no {reader.split} sample that can be read")
+        raise ValueError(f"{self.index.place} has no {reader.split} sample that can be read")
 
     def _keep(self, split: str, loader: Any) -> Any:
         if split in self._loaders:

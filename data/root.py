@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from data import remote
 from data.manifest import MANIFEST
 from data.sample import SAMPLES
+from data.shards.folders import UPLOAD, remote_folder
 from data.shards.index import INDEX
 
 SAMPLE = "sample:"
@@ -20,23 +22,30 @@ class Root:
 
     Attributes:
         kind: `frames`: ingested, a manifest and EXR files; `shards`: prepared.
-        path: The folder.
+        path: The folder; of shards at a URL, that of their copies on this machine.
+        url: Where the shards lie, None on this machine.
     """
 
     kind: Literal["frames", "shards"]
     path: Path
+    url: str | None = None
 
 
 def resolve_root(root: str | Path) -> Root:
     """Return what a data root is.
 
     Args:
-        root: `sample:NAME`, an ingested folder or a prepared folder; `~` is the home folder.
+        root: `sample:NAME`, an ingested folder or a prepared folder, `~` is the home folder; or the URL of
+            shards.
 
     Raises:
         ValueError: It is none of these; the message says which command makes it one.
         FileNotFoundError: There is no such folder or sample.
+        OSError: A URL cannot be read.
     """
+    url = remote.url_of(root)
+    if url is not None:
+        return _at_url(url)
     if str(root).startswith(SAMPLE):
         return _sample(str(root).removeprefix(SAMPLE))
     path = Path(root).expanduser()
@@ -57,6 +66,26 @@ def resolve_root(root: str | Path) -> Root:
             f"{' or '.join(SAMPLE + name for name in SAMPLES)}"
         )
     raise ValueError(_advice(path))
+
+
+def _at_url(url: str) -> Root:
+    if remote.exists(remote.join(url, INDEX)):
+        return Root("shards", remote_folder(), url)
+    place = remote.shown(url)
+    if remote.exists(remote.join(url, UPLOAD)):
+        raise ValueError(
+            f"{place} is not finished, its upload was interrupted; continue it with: trainer prepare FRAMES "
+            f"--output {place}"
+        )
+    if remote.exists(remote.join(url, MANIFEST)):
+        raise ValueError(
+            f"{place} holds frames; over the network only shards are read. Copy the frames to this machine "
+            f"and write shards there: trainer prepare FRAMES --output {place}-shards"
+        )
+    raise FileNotFoundError(
+        f"{place} holds no shards (there is no {INDEX}); check the address, or write shards there: "
+        f"trainer prepare FRAMES --output {place}"
+    )
 
 
 def _sample(name: str) -> Root:

@@ -20,10 +20,17 @@ Batch = dict[str, Any]
 
 
 class Order(NamedTuple):
-    """What a worker is told to read: samples of one batch, and the epoch for augmentation."""
+    """What a worker is told to read.
+
+    Attributes:
+        epoch: For augmentation.
+        samples: Of one batch.
+        ahead: Shards in the order in which this batch and the next ones need them, where they lie at a URL.
+    """
 
     epoch: int
     samples: tuple[int, ...]
+    ahead: tuple[int, ...] = ()
 
 
 class Packed(NamedTuple):
@@ -38,6 +45,8 @@ class Packed(NamedTuple):
         corrupt: Samples that were left out, with the reason.
         error: Why there is no batch. Raised in a worker it would arrive as another type, with a traceback for
             its message.
+        read: Bytes of the samples in their shards.
+        downloaded: Bytes that the process has downloaded since it made its last batch.
     """
 
     pixels: Tensor
@@ -47,6 +56,8 @@ class Packed(NamedTuple):
     corrupt: tuple[tuple[str, str], ...]
     error: Exception | None = None
     channels: tuple[str, ...] = ()
+    read: int = 0
+    downloaded: int = 0
 
     def unpack(self) -> Batch:
         """Return the batch: views of `pixels`, frame numbers, scenes, frames, keys."""
@@ -113,7 +124,9 @@ class Batches(Dataset[Packed]):
         Raises:
             CorruptSampleError: A sample is damaged and is not to be skipped.
             ValueError: A buffer is missing, or samples of different size would be in one batch.
+            OSError: A shard at a URL cannot be read.
         """
+        self.reader.begin(order.ahead)
         numbers, corrupt = self._readable(order.samples)
         samples = [self.reader.sample(number) for number in numbers]
         if not samples:
@@ -139,6 +152,8 @@ class Batches(Dataset[Packed]):
             tuple((sample.scene, sample.frame, sample.key) for sample in samples),
             corrupt,
             channels=samples[0].sample_channels if SAMPLES in self.names else (),
+            read=sum(self.reader.bytes_of(number) for number in numbers),
+            downloaded=0 if self.reader.cache is None else self.reader.cache.take_count(),
         )
 
     def _readable(self, numbers: Iterable[int]) -> tuple[list[int], tuple[tuple[str, str], ...]]:

@@ -13,6 +13,7 @@ from data.importance import PUBLISHED_SHARE
 from data.manifest import FrameRecord
 from data.shards.division import Candidate, plan_shards
 from data.shards.options import PrepareOptions
+from data.shards.progress import size_text
 
 _SAMPLE_OVERHEAD = 2400
 """Bytes of a sample beside its arrays: two tar headers, the JSON and padding."""
@@ -79,11 +80,6 @@ def check_room(root: Path, output: Path, expected: Estimate) -> None:
             "--output DIR",
             str(output.parent),
         )
-
-
-def size_text(number: int) -> str:
-    """Return bytes as `12 MB` or `3.4 GB`."""
-    return f"{number / 1e9:.1f} GB" if number >= 1e9 else f"{number / 1e6:.0f} MB"
 
 
 def _bytes_per_pixel(record: FrameRecord, options: PrepareOptions) -> int:

@@ -1,17 +1,33 @@
-"""The index of a folder of shards: what is in which file, where, and with which checksum."""
+"""The index of a folder of shards: what is in which file, where, and with which checksum.
+
+It is not trusted: names cannot leave the folder, samples lie inside their shard and beside each other. An index
+has at most `LARGEST` bytes, and reading it takes at most about thirty times as many as it has.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import tarfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from data import remote
+from data.shards.description import text, whole
 
 FORMAT = "penumbra-shards"
 VERSION = 1
 INDEX = "index.json"
 SPLITS = ("train", "validation", "test")
+LARGEST = 1 << 28
+"""Bytes of an index, at most; that is enough for about three million samples."""
+
+LARGEST_SHARD = 1 << 42
+BLOCK = tarfile.BLOCKSIZE
+_FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,250}", re.ASCII)
+_SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -46,11 +62,36 @@ class ShardRecord:
 
     @classmethod
     def from_dict(cls, record: dict[str, Any]) -> ShardRecord:
-        """Return the record that `to_dict` wrote."""
-        samples = tuple(SampleRecord(**sample) for sample in record["samples"])
+        """Return the record that `to_dict` wrote.
+
+        Raises:
+            ValueError: A value cannot be what it should be.
+            KeyError: One is missing.
+            TypeError: One has another type, or there are too many.
+        """
+        file, sha256 = text(record["file"], "file"), text(record["sha256"], "sha256")
+        if not _FILE.fullmatch(file):
+            raise ValueError(f"{file[:80]!r} is no name of a file in this folder")
+        if not _SHA256.fullmatch(sha256):
+            raise ValueError(f"the sha256 of {file} is {sha256[:80]!r}")
+        if record["split"] not in SPLITS:
+            raise ValueError(f"{file} has a split other than {', '.join(SPLITS)}")
+        size = whole(record["bytes"], f"bytes of {file}", 0, LARGEST_SHARD)
         kept = record.get("per_sample")
-        per_sample = None if kept is None else (int(kept[0]), tuple(kept[1]))
-        return cls(**{**record, "samples": samples, "per_sample": per_sample})
+        per_sample = None if kept is None else _per_sample(*kept)
+        known = {"file": file, "split": record["split"], "scene": text(record["scene"], "scene")}
+        counts = {name: whole(record.get(name, 0), name, 0, 2**48) for name in ("skipped", "pruned")}
+        unknown = record.keys() - known.keys() - counts.keys() - {"sha256", "bytes", "samples", "per_sample"}
+        if unknown:
+            raise TypeError(f"unknown entry {sorted(unknown)[0][:80]!r}")
+        return cls(
+            **known,
+            sha256=sha256,
+            bytes=size,
+            samples=_samples(file, record["samples"], size),
+            per_sample=per_sample,
+            **counts,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -63,13 +104,14 @@ class Index:
     """What a folder of shards holds.
 
     Attributes:
-        root: The folder.
+        root: The folder; of shards at a URL, that of their copies on this machine.
         manifest_hash: Hash of the manifest of the frames that the shards were cut from.
         manifest: That manifest.
         options: Options of the preparation.
         shards: All shards, in the order of split and number.
         skipped: Planned patches that were left out because their reference is black.
         pruned: Candidates of importance sampling that were dropped.
+        url: Where the shards lie, None on this machine.
     """
 
     root: Path
@@ -79,6 +121,12 @@ class Index:
     shards: tuple[ShardRecord, ...]
     skipped: int = 0
     pruned: int = 0
+    url: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Folder or URL, for messages."""
+        return str(self.root) if self.url is None else remote.shown(self.url)
 
     def of(self, split: str) -> tuple[ShardRecord, ...]:
         """Return the shards of a split."""
@@ -120,28 +168,64 @@ class Index:
             OSError: There is no index, or it cannot be read.
         """
         path = root / INDEX
-        try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-            if record["format"] != FORMAT or record["version"] != VERSION:
-                raise ValueError(f"format {record['format']!r}, version {record['version']!r}")
-            shards = tuple(ShardRecord.from_dict(shard) for shard in record["shards"])
-            index = cls(
-                root,
-                record["manifest_hash"],
-                record["manifest"],
-                record["options"],
-                shards,
-                record["skipped"],
-                record.get("pruned", 0),
-            )
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{path} is not an index of shards that this version reads ({FORMAT} version {VERSION}): "
-                f"{error}; prepare the shards again with: trainer prepare FRAMES --output SHARDS"
-            ) from error
+        size = path.stat().st_size
+        if size > LARGEST:
+            raise ValueError(f"{path} has {size} bytes, an index has at most {LARGEST}")
+        index = cls.parse(path.read_bytes(), root, str(path))
         if check_sizes:
             index._check_sizes()
         return index
+
+    @classmethod
+    def read_remote(cls, url: str, root: Path) -> Index:
+        """Read and check the index of shards at a URL, whose copies will lie in `root`.
+
+        Raises:
+            ValueError: As `read`.
+            OSError: As `data.remote.fetch`.
+        """
+        source = remote.join(url, INDEX)
+        return cls.parse(remote.read_bytes(source, LARGEST), root, remote.shown(source), url)
+
+    @classmethod
+    def parse(cls, data: bytes, root: Path, source: str, url: str | None = None) -> Index:
+        """Return the index that these bytes are.
+
+        Args:
+            data: Content of `index.json`.
+            root: As the attribute.
+            source: Where it came from, for messages.
+            url: As the attribute.
+
+        Raises:
+            ValueError: It is none that this version reads.
+        """
+        try:
+            record = json.loads(data)
+            if record["format"] != FORMAT or record["version"] != VERSION:
+                raise ValueError(f"format {record['format']!r:.80}, version {record['version']!r:.80}")
+            shards = tuple(ShardRecord.from_dict(shard) for shard in record["shards"])
+            if len({shard.file for shard in shards}) < len(shards):
+                raise ValueError("it names a file twice")
+            if not all(shard.samples for shard in shards):
+                raise ValueError("it names a file without samples")
+            if not isinstance(record["manifest"], dict) or not isinstance(record["options"], dict):
+                raise TypeError("manifest and options are no tables")
+            return cls(
+                root,
+                text(record["manifest_hash"], "manifest_hash"),
+                record["manifest"],
+                record["options"],
+                shards,
+                whole(record["skipped"], "skipped", 0, 2**48),
+                whole(record.get("pruned", 0), "pruned", 0, 2**48),
+                url,
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(
+                f"{source} is not an index of shards that this version reads ({FORMAT} version {VERSION}): "
+                f"{error}; prepare the shards again with: trainer prepare FRAMES --output SHARDS"
+            ) from error
 
     def _check_sizes(self) -> None:
         for shard in self.shards:
@@ -154,6 +238,26 @@ class Index:
                     "copy the shard again, or prepare anew: trainer prepare FRAMES --output "
                     f"{self.root} --force"
                 )
+
+
+def _samples(file: str, records: Any, end: int) -> tuple[SampleRecord, ...]:
+    """Return the samples of a shard of `end` bytes, which lie one after another."""
+    samples = []
+    free = 0
+    for record in records:
+        sample = SampleRecord(**record)
+        text(sample.key, "key", 1000)
+        offset = whole(sample.offset, f"offset of {sample.key} in {file}", free, end)
+        if offset % BLOCK:
+            raise ValueError(f"{sample.key} in {file} begins at byte {offset}, no multiple of {BLOCK}")
+        free = offset + whole(sample.size, f"size of {sample.key} in {file}", 2 * BLOCK, end - offset)
+        whole(sample.crc32, f"crc32 of {sample.key} in {file}", 0, 2**32 - 1)
+        samples.append(sample)
+    return tuple(samples)
+
+
+def _per_sample(count: Any, channels: Any) -> tuple[int, tuple[str, ...]]:
+    return whole(count, "per_sample", 1, 2**20), tuple(text(name, "per_sample") for name in channels)
 
 
 def write_json(path: Path, record: Any) -> None:

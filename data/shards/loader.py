@@ -17,7 +17,7 @@ import torch
 from torch.utils.data import DataLoader, Sampler
 
 from data.shards.batch import Batch, Batches, Order, Packed
-from data.shards.plan import batches_per_epoch, evaluation_samples, training_epoch
+from data.shards.plan import batches_per_epoch, evaluation_samples, shards_ahead, training_epoch
 
 logger = logging.getLogger("data")
 
@@ -52,6 +52,7 @@ class _Loader:
         self.batches, self.workers, self.pin_memory = batches, workers, pin_memory
         self.corrupt: dict[str, str] = {}
         self.waited_s = 0.0  # seconds that callers have waited for batches so far
+        self.read_bytes = self.downloaded_bytes = 0  # of this rank so far; see `Packed`
         self._orders = _Orders()
         self._inner: DataLoader | None = None
 
@@ -76,6 +77,8 @@ class _Loader:
                 if sample not in self.corrupt:
                     self.corrupt[sample] = reason
                     warnings.warn(f"left out ({len(self.corrupt)} so far): {reason}", stacklevel=2)
+            self.read_bytes += packed.read
+            self.downloaded_bytes += packed.downloaded
             if packed.samples:
                 yield packed.unpack()
 
@@ -85,6 +88,17 @@ class _Loader:
             self.waited_s += time.perf_counter() - began
             yield packed
             began = time.perf_counter()
+
+    @property
+    def remote(self) -> bool:
+        """Whether the shards lie at a URL."""
+        return self.batches.reader.cache is not None
+
+    def _orders_of(self, epoch: int, batches: list[list[int]]) -> list[Order]:
+        ahead: list[tuple[int, ...]] = [()] * len(batches)
+        if self.remote:
+            ahead = shards_ahead(self.batches.reader.shard_sizes, batches)
+        return [Order(epoch, tuple(batch), coming) for batch, coming in zip(batches, ahead, strict=True)]
 
     def close(self) -> None:
         """End the worker processes; iterating starts them again."""
@@ -167,8 +181,7 @@ class TrainingLoader(_Loader):
             self.batch_size,
         )
         self.position = start
-        orders = [Order(epoch, tuple(row)) for row in shuffled[start:].tolist()]
-        for batch in self._read(orders):
+        for batch in self._read(self._orders_of(epoch, shuffled[start:].tolist())):
             self.position += 1
             yield batch
 
@@ -239,7 +252,7 @@ class EvaluationLoader(_Loader):
     ) -> None:
         super().__init__(batches, workers, pin_memory)
         mine = evaluation_samples(len(batches), rank, world).tolist()
-        self.orders = [Order(0, tuple(mine[i : i + batch_size])) for i in range(0, len(mine), batch_size)]
+        self.orders = self._orders_of(0, [mine[i : i + batch_size] for i in range(0, len(mine), batch_size)])
 
     def __len__(self) -> int:
         return len(self.orders)

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
 
+AHEAD, LOOK = 32, 256
+"""Shards that are downloaded ahead, at most, and batches that are looked at for them."""
+
 
 def batches_per_epoch(shard_sizes: Sequence[int], world: int, batch_size: int) -> int:
     """Return the number of training batches that every rank sees in an epoch.
@@ -81,6 +84,26 @@ def evaluation_samples(total: int, rank: int, world: int) -> Indices:
     Ranks may get one more or one less; nothing is repeated to make them even.
     """
     return np.arange(rank, total, world, dtype=np.int64)
+
+
+def shards_ahead(shard_sizes: Sequence[int], batches: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
+    """Return for each batch the shards that it and the batches after it need next, `AHEAD` at most.
+
+    Args:
+        shard_sizes: Number of samples of each shard; sample numbers count through the shards.
+        batches: Numbers of the samples of each batch, in order.
+    """
+    ends = np.cumsum(shard_sizes)
+    shards = [np.searchsorted(ends, batch, side="right").tolist() for batch in batches]
+    ahead = []
+    for number in range(len(shards)):
+        found: dict[int, None] = {}
+        for later in shards[number : number + LOOK]:
+            found.update(dict.fromkeys(later))
+            if len(found) >= AHEAD:
+                break
+        ahead.append(tuple(found)[:AHEAD])
+    return ahead
 
 
 def _generator(*words: int) -> np.random.Generator:

@@ -21,9 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from data.frames import FrameSet
+from data.jobs import Job, elsewhere
+from data.manifest import MANIFEST
 from data.shards.cut import CUT_VERSION, make_scene
 from data.shards.division import Kind, ShardPlan, different_samples, kind_of, plan_shards
 from data.shards.estimate import announcement, check_room, estimate
+from data.shards.folders import cache_folder
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
 from data.shards.options import PrepareOptions
 from data.shards.processes import in_processes
@@ -75,12 +78,7 @@ def prepare(
             return Index.read(output)
         _check_output(output, force)
         work = output.with_name(output.name + ".partial")
-        identity = {
-            "version": VERSION,
-            "cut_version": CUT_VERSION,
-            "manifest_hash": frames.manifest.hash,
-            "options": options.to_dict(),
-        }
+        identity = identity_of(frames, options)
         plans = plan_shards(frames, options)  # fails before anything is left behind
         _open_work(work, identity, force)
         records = _make_all(frames, work, plans, options, processes, progress or (lambda done, total: None))
@@ -97,11 +95,6 @@ def prepare(
         ).write()
         _publish(work, output)
         return Index.read(output)
-
-
-def cache_folder() -> Path:
-    """Return where automatically prepared shards are kept: `$PENUMBRA_CACHE`, or ~/.cache/penumbra."""
-    return Path(os.environ.get("PENUMBRA_CACHE") or Path.home() / ".cache" / "penumbra").absolute()
 
 
 def prepare_cached(root: Path, options: PrepareOptions, progress: Progress | None = None) -> Index:
@@ -130,6 +123,16 @@ def _cache_processes(frames: int) -> int:
     if frames <= MANY_FRAMES or multiprocessing.current_process().daemon:  # which may not start others
         return 1
     return min(os.cpu_count() or 1, MOST_PROCESSES)
+
+
+def identity_of(frames: FrameSet, options: PrepareOptions) -> dict[str, Any]:
+    """Return what shards follow from: the same identity gives the same shards."""
+    return {
+        "version": VERSION,
+        "cut_version": CUT_VERSION,
+        "manifest_hash": frames.manifest.hash,
+        "options": options.to_dict(),
+    }
 
 
 def cached_path(root: Path, options: PrepareOptions) -> Path:
@@ -162,7 +165,10 @@ def _make_all(
 
     report()
     jobs = [(str(frames.root), scene, group, options, str(work)) for scene, group in missing.items()]
-    if processes > 1 and len(jobs) > 1:
+    if runner := elsewhere():
+        seen = (frames.root / MANIFEST, work / "plan.json")
+        runner([Job(f"scene {job[1]}", make_scene, job, seen) for job in jobs], lambda job, result: report())
+    elif processes > 1 and len(jobs) > 1:
         in_processes(make_scene, jobs, min(processes, len(jobs)), report)
     else:
         for job in jobs:

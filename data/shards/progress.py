@@ -14,6 +14,11 @@ def duration(seconds: float) -> str:
     return text
 
 
+def size_text(number: int) -> str:
+    """Return bytes as `12 MB` or `3.4 GB`."""
+    return f"{number / 1e9:.1f} GB" if number >= 1e9 else f"{number / 1e6:.0f} MB"
+
+
 class Rate:
     """Samples per second and time left since the first call; samples of an earlier run do not count.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
@@ -21,6 +21,16 @@ class _Left(ProgressColumn):
         return Text("" if left is None else f"{duration(left)} left", style="cyan")
 
 
+class _Mark(NamedTuple):
+    """Where training stood at the last report."""
+
+    time: float
+    patches: int
+    waited_s: float
+    read: int
+    downloaded: int
+
+
 def duration(seconds: float) -> str:
     """Return a duration as a person says it: `48 s`, `7:05`, `2:10:00`."""
     whole = round(seconds)
@@ -34,7 +44,9 @@ class TrainingProgress(ProgressBar):
     """Progress of fit, validate and test: a live bar on a terminal, plain lines elsewhere.
 
     Logs `throughput/patches_per_s` and `throughput/waiting` (share of the time since the last report that
-    was spent waiting for data) every `log_every_n_steps` steps.
+    was spent waiting for data) every `log_every_n_steps` steps. Where the shards lie at a URL also
+    `throughput/read_mb_per_s`, the samples of batches as they are stored, and
+    `throughput/downloaded_mb_per_s`, what came over the network, both of this rank times the number of ranks.
 
     Args:
         plain_interval_s: Seconds between two plain lines.
@@ -49,10 +61,11 @@ class TrainingProgress(ProgressBar):
         self._printed = 0.0
         self._started = 0.0
         self._first_step = 0
-        self._mark = (0.0, 0, 0.0)  # time, patches, seconds waited at the last report
+        self._mark = _Mark(0.0, 0, 0.0, 0, 0)
         self._patches = 0
         self._rate = 0.0
         self._waiting = 0.0
+        self._traffic: tuple[float, float] | None = None  # MB/s read and downloaded, of shards at a URL
         self._loss: float | None = None
         self._gap: float | None = None
         self._paused_s = 0.0
@@ -69,7 +82,7 @@ class TrainingProgress(ProgressBar):
         """Start the clock."""
         self._started = self._printed = time.monotonic()
         self._first_step = trainer.global_step
-        self._mark = (self._started, 0, waited(trainer))
+        self._mark = _Mark(self._started, 0, waited(trainer), *traffic(trainer))
         self._patches, self._paused_s = 0, 0.0
         if self._enabled and sys.stderr.isatty():
             self._bar = Progress(
@@ -92,10 +105,7 @@ class TrainingProgress(ProgressBar):
         due = step % every == 0
         if due or batch_idx + 1 == trainer.num_training_batches:
             self._measure(trainer)
-            pl_module.log_dict(
-                {"throughput/patches_per_s": self._rate, "throughput/waiting": self._waiting},
-                rank_zero_only=True,
-            )
+            pl_module.log_dict(self._throughput(), rank_zero_only=True)
         if self._enabled and (self._bar is not None or due):
             self._read(outputs)
         self._show(trainer)
@@ -108,7 +118,7 @@ class TrainingProgress(ProgressBar):
         """Print the validation score of the epoch."""
         pause = time.monotonic() - self._validation_began
         self._paused_s += pause
-        self._mark = (self._mark[0] + pause, *self._mark[1:])
+        self._mark = self._mark._replace(time=self._mark.time + pause)
         if self._enabled and not trainer.sanity_checking and trainer.state.fn == "fit":
             self._line(f"epoch {trainer.current_epoch}: {self._scores(trainer)}")
 
@@ -140,17 +150,33 @@ class TrainingProgress(ProgressBar):
             self._gap = float(numbers["gap"])
 
     def _measure(self, trainer: Trainer) -> None:
-        now, waiting = time.monotonic(), waited(trainer)
-        then, patches, waiting_then = self._mark
-        elapsed = max(now - then, 1e-9)
-        self._rate = (self._patches - patches) / elapsed
-        self._waiting = min(max((waiting - waiting_then) / elapsed, 0.0), 1.0)
-        self._mark = (now, self._patches, waiting)
+        last = self._mark
+        now = _Mark(time.monotonic(), self._patches, waited(trainer), *traffic(trainer))
+        elapsed = max(now.time - last.time, 1e-9)
+        self._rate = (now.patches - last.patches) / elapsed
+        self._waiting = min(max((now.waited_s - last.waited_s) / elapsed, 0.0), 1.0)
+        if getattr(trainer.train_dataloader, "remote", False):
+            ranks = trainer.world_size / elapsed / 1e6
+            self._traffic = (
+                (now.read - last.read) * ranks,
+                (now.downloaded - last.downloaded) * ranks,
+            )
+        self._mark = now
+
+    def _throughput(self) -> dict[str, float]:
+        found = {"throughput/patches_per_s": self._rate, "throughput/waiting": self._waiting}
+        if self._traffic is not None:
+            read, downloaded = self._traffic
+            found |= {"throughput/read_mb_per_s": read, "throughput/downloaded_mb_per_s": downloaded}
+        return found
 
     def _numbers(self, trainer: Trainer) -> list[str]:
         parts = []
         if self._rate:  # nothing is measured before the first report
             parts = [f"{self._rate:.1f} patches/s", f"waiting {self._waiting:.1%}"]
+            if self._traffic is not None:
+                read, downloaded = self._traffic
+                parts.append(f"shards {read:.1f} MB/s, {downloaded:.1f} MB/s downloaded")
         if self._loss is not None:
             parts.append(f"loss {self._loss:.4f}")
         if self._gap is not None:
@@ -204,3 +230,10 @@ def total_steps(trainer: Trainer) -> float:
 def waited(trainer: Trainer) -> float:
     """Return the seconds that the training loader has made its caller wait, 0 where it does not count."""
     return float(getattr(trainer.train_dataloader, "waited_s", 0.0))
+
+
+def traffic(trainer: Trainer) -> tuple[int, int]:
+    """Return the bytes of shards that batches took so far, and those that were downloaded; 0 where the loader
+    does not count."""
+    loader = trainer.train_dataloader
+    return int(getattr(loader, "read_bytes", 0)), int(getattr(loader, "downloaded_bytes", 0))

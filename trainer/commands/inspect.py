@@ -20,7 +20,9 @@ HELP = "say what a file, a data set or shards contain"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options."""
     parser.add_argument(
-        "path", metavar="PATH", help="an EXR file, a data set, the root of a layout, shards, or sample:bmfr"
+        "path",
+        metavar="PATH",
+        help="an EXR file, a data set, the root of a layout, shards, sample:bmfr, or the URL of shards",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     parser.add_argument(
@@ -40,15 +42,19 @@ def run(args: argparse.Namespace) -> int:
         ValueError: The path is nothing that can be inspected, or damaged; or the page is there already.
         OSError: It does not exist or cannot be read, or the page cannot be written.
     """
-    from data.inspection import inspect_path
+    from data.inspection import inspect_path, inspect_url
+    from data.remote import shown, url_of
 
+    url = url_of(args.path)
+    if url is not None and args.html is not None:
+        raise ValueError(f"--html shows frames on this machine, and {shown(url)} can hold shards only")
     path = _resolve(args.path)
     if args.html is not None:
         return _write_page(path, args)
     for name in ("processes", "force"):
         if getattr(args, name):
             raise ValueError(f"--{name} is for --html FILE, which is not given")
-    found = inspect_path(path)
+    found = inspect_path(path) if url is None else inspect_url(url)
     if args.json:
         print(json.dumps(found, indent=1, ensure_ascii=False))
     else:
@@ -242,7 +248,7 @@ def _print_problems(found: Mapping[str, Any], console: Console) -> None:
     for problem in found["problems"]:
         _line(console, f"problem: {problem}")
     if not found["problems"]:
-        _line(console, "checksums: all files match")
+        _line(console, f"{found.get('checked', 'checksums')}: all files match")
 
 
 def _known(value: Any) -> str:

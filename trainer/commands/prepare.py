@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("source", metavar="DIR", help="ingested or rendered frames, or sample:NAME")
-    parser.add_argument("--output", required=True, metavar="SHARDS", type=Path, help="folder to make")
+    parser.add_argument(
+        "--output",
+        required=True,
+        metavar="SHARDS",
+        help="folder to make, or s3://BUCKET/SHARDS, or http(s)://HOST/SHARDS of a server that takes PUT",
+    )
     parser.add_argument("--recipe", choices=("bmfr", "afgsa", "layers"), help="see below (default: none)")
     _add_positions(parser)
     _add_contents(parser)
@@ -122,21 +127,42 @@ def _add_contents(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check(args: argparse.Namespace) -> None:
+    """Check the options alone; nothing is read or cut.
+
+    Raises:
+        UsageError: Some do not fit.
+    """
+    from trainer.configs import UsageError
+
+    try:
+        if args.processes < 1:
+            raise ValueError(f"--processes is {args.processes}; expected at least 1")
+        _options(args)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 def run(args: argparse.Namespace) -> int:
     """Prepare, and print what was made."""
+    from data.remote import shown, url_of
     from data.root import resolve_root
     from data.shards.prepare import prepare
 
+    url = url_of(args.output)
     root = resolve_root(args.source)
     if root.kind != "frames":
         raise ValueError(f"{args.source} holds shards already; name a folder made by `trainer ingest`")
     if args.processes < 1:
         raise ValueError(f"--processes is {args.processes}; expected at least 1")
     options = _options(args)
+    if url is not None:
+        _print(shown(url), _publish(root.path, url, options, args), options)
+        return 0
     with _progress(f"preparing {root.path.name}", _unit(options)) as progress:
         index = prepare(
             root.path,
-            args.output,
+            Path(args.output),
             options,
             processes=args.processes,
             force=args.force,
@@ -144,6 +170,29 @@ def run(args: argparse.Namespace) -> int:
         )
     _print(args.output, index, options)
     return 0
+
+
+def _publish(root: Path, url: str, options: PrepareOptions, args: argparse.Namespace) -> Index:
+    """Cut and send, with a bar for each."""
+    from data.remote import shown
+    from data.shards.publish import publish
+
+    with ExitStack() as bars:
+
+        def sending() -> Progress:
+            bars.close()  # the bar of cutting
+            return bars.enter_context(_progress(f"sending to {shown(url)}", "MB"))
+
+        cutting = bars.enter_context(_progress(f"preparing {root.name}", _unit(options)))
+        return publish(
+            root,
+            url,
+            options,
+            processes=args.processes,
+            force=args.force,
+            cutting=cutting,
+            sending=sending,
+        )
 
 
 def _options(args: argparse.Namespace) -> PrepareOptions:
@@ -161,7 +210,7 @@ def _unit(options: PrepareOptions) -> str:
     return "candidates" if options.sampling == "importance" else "samples"
 
 
-def _print(output: Path, index: Index, options: PrepareOptions) -> None:
+def _print(output: str, index: Index, options: PrepareOptions) -> None:
     size = sum(shard.bytes for shard in index.shards) / 1e6
     print(f"{output}: {len(index.shards)} shards, {size:.1f} MB")
     for split in ("train", "validation", "test"):
