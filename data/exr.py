@@ -75,7 +75,7 @@ class RadianceWarning(UserWarning):
     """A radiance buffer looks as if it came from an 8-bit or tone-mapped image."""
 
 
-def read_frame(path: str | Path, only: str | None = None) -> Frame:
+def read_frame(path: str | Path, only: str | None = None, layers: Mapping[str, str] | None = None) -> Frame:
     """Read a frame from one EXR file.
 
     Values that are not finite are replaced by each buffer's policy and counted in `notes["repaired"]`; pixels
@@ -85,15 +85,17 @@ def read_frame(path: str | Path, only: str | None = None) -> Frame:
     Args:
         path: The file. Without our header attributes, scene and index come from its folder and name.
         only: The buffer that a file with plain R, G, B holds; taken from the file's name where None.
+        layers: Layer of the file → the buffer that it is, where its name does not say so.
 
     Raises:
         OSError: The file cannot be opened.
-        ValueError: It cannot be read as a frame: damaged, no EXR, unknown or incomplete channel names.
+        ValueError: It cannot be read as a frame: damaged, no EXR, unknown or incomplete channel names; or it
+            lacks a layer that `layers` names.
 
     Warns:
         RadianceWarning: Radiance that looks 8-bit or tone-mapped.
     """
-    return _read(Path(path), only, None).frame
+    return _read(Path(path), only, None, layers=layers).frame
 
 
 def read_stored(path: str | Path, choose: Choose, samples: bool = True) -> StoredFrame:
@@ -116,8 +118,14 @@ def read_stored(path: str | Path, choose: Choose, samples: bool = True) -> Store
     return _read(Path(path), None, choose, samples)
 
 
-def _read(path: Path, only: str | None, choose: Choose | None, with_samples: bool = True) -> StoredFrame:
-    image = read_exr(path, keep_half=True)
+def _read(
+    path: Path,
+    only: str | None,
+    choose: Choose | None,
+    with_samples: bool = True,
+    layers: Mapping[str, str] | None = None,
+) -> StoredFrame:
+    image = _renamed(read_exr(path, keep_half=True), layers or {})
     own = _MARK in image.attributes
     groups, ignored = _groups(image, only, any(map(is_sample, image.channels)))
     kept = read_samples(image, own) if with_samples or not groups else ReadSamples()
@@ -146,6 +154,28 @@ def _read(path: Path, only: str | None, choose: Choose | None, with_samples: boo
         for name, array in buffers.items():
             _warn_unless_radiance(path, name, array)
     return StoredFrame(frame, halves)
+
+
+def _renamed(image: ExrImage, layers: Mapping[str, str]) -> ExrImage:
+    """Return the image with other names of layers; those of the same name that were there are left out."""
+    if not layers:
+        return image
+    found = {channel: channel.rpartition(".")[0] for channel in image.channels}
+    if missing := [layer for layer in layers if layer not in found.values()]:
+        there = ", ".join(dict.fromkeys(layer or "(none)" for layer in found.values()))
+        raise ValueError(f"{image.path}: there is no layer {missing[0]!r}; the layers are {there}")
+    names = {}
+    for channel, layer in found.items():
+        if layer in layers:
+            names[channel] = f"{layers[layer]}.{channel.rpartition('.')[2]}"
+        elif layer not in layers.values():
+            names[channel] = channel
+    return replace(
+        image,
+        channels={names[c]: array for c, array in image.channels.items() if c in names},
+        precision={names[c]: stored for c, stored in image.precision.items() if c in names},
+        outside={names[c]: hidden for c, hidden in image.outside.items() if c in names},
+    )
 
 
 def _chosen(
@@ -180,7 +210,9 @@ def _converted(image: ExrImage, name: str, channels: list[str], planar: bool) ->
     return array, int(hidden.sum())
 
 
-def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = None) -> dict[str, str]:
+def write_frame(
+    frame: Frame, path: str | Path, only: Iterable[str] | None = None, single: bool = False
+) -> dict[str, str]:
     """Write a frame as one EXR file in our naming, whole or not at all.
 
     Half precision where the vocabulary allows it and the range fits (no value above 65504, and not all so
@@ -190,6 +222,7 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
         frame: What to write, with scene, index, camera, exposure and spp in header attributes.
         path: Target.
         only: Names of the buffers to write; None: all of the frame, and its samples.
+        single: Write all buffers as float32.
 
     Returns:
         Buffer → `half` or `float`, as written.
@@ -208,7 +241,7 @@ def write_frame(frame: Frame, path: str | Path, only: Iterable[str] | None = Non
             raise ValueError(
                 f"{frame.label}: buffer {name!r} holds NaN or Inf; repair it before writing {path}"
             )
-        half = _half_holds(array) if entry.half else _half_is_exact(array)
+        half = not single and (_half_holds(array) if entry.half else _half_is_exact(array))
         precision[name] = "half" if half else "float"
         for i, letter in enumerate(entry.letters):
             channels[f"{name}.{letter}"] = array[..., i].astype(np.float16 if half else np.float32)

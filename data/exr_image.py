@@ -115,6 +115,25 @@ def read_exr(path: str | Path, keep_half: bool = False) -> ExrImage:
     return _compose(path, parts, keep_half)
 
 
+def exr_extent(path: str | Path) -> tuple[int, int, int]:
+    """Return the rows and columns of a file's largest window, and its channels, without reading pixels.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: The file cannot be opened.
+        ValueError: As `read_exr`, as far as the header tells.
+    """
+    path = Path(path)
+    _check_header(path)
+    headers = _headers(path)
+    _check_size(path, headers)
+    if not headers:
+        raise ValueError(f"{path}: EXR file without parts")
+    sizes = [_extent(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
+    count = sum(len(header["channels"]) for header in headers)
+    return max(height for _, height in sizes), max(width for width, _ in sizes), count
+
+
 def exr_channels(path: str | Path) -> list[str]:
     """Return the names of a file's channels without reading pixels; names as `read_exr` gives them.
 

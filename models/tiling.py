@@ -30,6 +30,12 @@ work would be halo. So a pixel is read about nine times at most."""
 DEFAULT_BUDGET = 2 * 1024**3
 """Working memory in bytes where the caller names none: four million pixels in one piece."""
 
+Call = Callable[[Mapping[str, Tensor]], Any]
+"""A method on the buffers of a tile; returns `Denoised`, or the colour alone."""
+
+Run = Callable[[Call, Mapping[str, Tensor]], Any]
+"""Calls a method, such as in another thread or with tiles of other images in one batch."""
+
 
 class Tileable(Protocol):
     """What tiling needs of a denoiser; exported artifacts offer the same.
@@ -162,6 +168,7 @@ def denoise_in_tiles(
     budget: int = DEFAULT_BUDGET,
     progress: Callable[[float], None] | None = None,
     pace: Pace | None = None,
+    run: Run | None = None,
 ) -> Denoised:
     """Denoise images of any size within a memory budget; equal to one untiled call to 1e-5.
 
@@ -170,10 +177,11 @@ def denoise_in_tiles(
         buffers: Tensors (B, C, H, W) for each of its inputs, sequences (B, T, C, H, W) for space-time
             methods, `samples` (B, S, C, H, W), optionally frame numbers (`exposure` …); those that `measure`
             gives and the mapping lacks are measured on these images.
-        tile: Largest side of a core in pixels, at least the method's multiple; None: from `budget`.
+        tile: Largest side of a core in pixels, at least the method's multiple; None: only `budget` limits it.
         budget: Working memory of the method in bytes.
         progress: Called after each tile with the share of the work that is done.
         pace: Of the method, to call `progress` within tiles too.
+        run: Calls the method on the buffers of a tile; None: here and now.
 
     Returns:
         Linear radiance (B, 3, H, W) or all frames (B, T, 3, H, W), and `aux` where the method returns it.
@@ -185,24 +193,25 @@ def denoise_in_tiles(
     numbers = numbers_of_frame(denoiser, buffers)
     multiple = denoiser.multiple
     tall, wide = _round_up(height, multiple), _round_up(width, multiple)
-    call: Callable[[Mapping[str, Tensor]], Any] = denoiser
+    call: Call = denoiser
     if getattr(denoiser, "frames", 0):
         call = denoiser.clip  # type: ignore[attr-defined]  # declared by methods with `frames`
-    if tile is None:
-        held = buffers[SAMPLES].shape[1:3].numel() if SAMPLES in denoiser.inputs else 0
-        core = core_size(denoiser, (tall, wide), budget, batch, held)
-    else:
-        core = (_even(tall, max(tile, 1), multiple), _even(wide, max(tile, 1), multiple))
+    held = buffers[SAMPLES].shape[1:3].numel() if SAMPLES in denoiser.inputs else 0
+    core = core_size(denoiser, (tall, wide), budget, batch, held)
+    if tile is not None:
+        rows, columns = (_even(side, max(tile, 1), multiple) for side in (tall, wide))
+        core = (min(core[0], rows), min(core[1], columns))
     whole = _Whole((tall, wide))
     for piece in tiles(tall, wide, core, aligned_halo(denoiser)):
-        rows, columns = piece.read
+        tile_rows, tile_columns = piece.read
         # Padded tile by tile, since a frame of many samples is large.
         part = {
-            name: _padded(name, buffers[name][..., rows, columns], multiple).contiguous()
+            name: _padded(name, buffers[name][..., tile_rows, tile_columns], multiple).contiguous()
             for name in denoiser.inputs
         }
         with _steps(progress, pace, whole.done, _share(piece, (tall, wide))):
-            result = call({**part, **numbers})
+            given = {**part, **numbers}
+            result = call(given) if run is None else run(call, given)
         whole.place(piece, result)
         if progress is not None:
             progress(whole.done)

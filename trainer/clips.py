@@ -84,9 +84,7 @@ def find_clips(paths: Iterable[str], split: str | None = None) -> list[Clip]:
         raise ValueError(
             f"--split {split} is for ingested data sets, but {next(iter(files))} holds single files"
         )
-    clips += [
-        _files(sorted(set(group), key=_order), folder, len(files) > 1) for folder, group in files.items()
-    ]
+    clips += [_files(in_order(set(group)), folder, len(files) > 1) for folder, group in files.items()]
     _refuse_same_names(clips)
     return clips
 
@@ -104,7 +102,7 @@ def _folder(path: Path, split: str | None) -> list[Clip]:
             return _layout(path, kind)
     if layout(BESIDE).likeness(path) > 0:
         return _layout(path, BESIDE)
-    found = sorted(path.glob("*.exr"), key=_order)
+    found = in_order(path.glob("*.exr"))
     if not found:
         raise ValueError(
             f"{path} holds nothing to denoise: no .exr files, no manifest.json, no folders of a known layout"
@@ -160,6 +158,11 @@ def _known_about(folder: Path) -> tuple[DepthKind, dict[str, float]]:
         return "euclidean", {}
     scene = manifest.scenes.get(folder.resolve().name)
     return manifest.depth, dict(scene.thresholds) if scene else {}
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return files as the frames of a sequence follow each other."""
+    return sorted(paths, key=_order)
 
 
 def _order(path: Path) -> tuple[str, list[tuple[int, str]]]:

@@ -22,7 +22,7 @@ from data.frame import Frame, Image
 from data.temporal import Accumulator
 from models.denoiser import Denoiser
 from models.pace import Pace
-from models.tiling import denoise_in_tiles
+from models.tiling import Run, denoise_in_tiles
 from trainer.attention import Attention, attention_of, attentive, inside
 from trainer.clips import Clip, Item
 from trainer.export.description import DISTRIBUTION, installed_version
@@ -45,6 +45,8 @@ class Settings:
         memory: Bytes that one call of the model may take; larger images are tiled.
         device: Where to run.
         attention: Column and row of the pixel whose attention is wanted.
+        tile: Largest side of a tile in pixels; None: only the memory limits it.
+        run: Calls the model on a tile; None: here and now.
     """
 
     exposure: float | None = None
@@ -53,6 +55,8 @@ class Settings:
     memory: int = 2 * 1024**3
     device: str = "cpu"
     attention: tuple[int, int] | None = None
+    tile: int | None = None
+    run: Run | None = None
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,7 @@ class ClipDenoiser:
         progress: Callable[[float], None] = lambda frames: None,
     ) -> None:
         self.loaded = loaded
-        self.model = loaded.model.deploy().eval()
+        self.model = loaded.deployed
         if settings.attention is not None:
             attentive(loaded.model, loaded.source.reference)
         self.clip = clip
@@ -167,9 +171,11 @@ class ClipDenoiser:
             denoised = denoise_in_tiles(
                 prepared.model,
                 buffers,
+                tile=self.settings.tile,
                 budget=self.settings.memory,
                 progress=advance,
                 pace=self.pace(prepared.model, buffers),
+                run=self.settings.run,
             )
         aux = {name: image[0] for name, image in (denoised.aux or {}).items()}
         return self.result(prepared, denoised.color[0], aux, self._attention(buffers))
@@ -177,10 +183,12 @@ class ClipDenoiser:
     def pace(self, model: Model, buffers: Mapping[str, Tensor]) -> Pace | None:
         """Return when the steps of a method come, None for images so small that it does not matter.
 
-        Measured on a corner of the first image or sequence of its length.
+        None too where the model is called elsewhere. Measured on a corner of the first image or sequence
+        of its length.
         """
         first = buffers[model.inputs[0]]
-        if not hasattr(model, "fused") or first[0, ..., 0, :, :].numel() < LARGE:
+        elsewhere = self.settings.run is not None
+        if elsewhere or not hasattr(model, "fused") or first[0, ..., 0, :, :].numel() < LARGE:
             return None
         key = (id(model), *first.shape[:-2])
         if key not in self._paces:

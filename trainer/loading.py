@@ -19,6 +19,7 @@ import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,6 +43,11 @@ class Loaded:
 
     model: Model
     source: Source
+
+    @cached_property
+    def deployed(self) -> Model:
+        """The form used for inference, made once."""
+        return self.model.deploy().eval()
 
 
 def load_model(model: str, device: str = "cpu", tracking_uri: str | None = None) -> Model:

@@ -152,9 +152,11 @@ class SequenceDenoiser(ClipDenoiser):
             denoised = denoise_in_tiles(
                 run.model,
                 buffers,
+                tile=self.settings.tile,
                 budget=self._budget(run),
                 progress=advance,
                 pace=self.pace(run.model, buffers),
+                run=self.settings.run,
             )
         for t, (item, prepared) in enumerate(waiting, first):
             aux = {name: layer[0, t] for name, layer in (denoised.aux or {}).items()}

@@ -394,7 +394,7 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_made(
     with pytest.raises(ValueError, match=f"--device {device}: {message}"):
         run("--model", "Exposed", folder, "--output", tmp_path / "out", "--device", device)
     assert not (tmp_path / "out").exists()
-    command._check_device("cuda:1")
+    command.check_device("cuda:1")
 
 
 @pytest.mark.parametrize("content", ["nothing", "shards"])
@@ -418,7 +418,7 @@ def test_missing_paths_and_a_file_as_output_are_errors(tmp_path: Path) -> None:
     ("text", "size"), [("2GB", 2 * 10**9), ("1.5 gib", 3 * 2**29), ("500M", 5 * 10**8), ("4096", 4096)]
 )
 def test_memory_sizes_are_understood(text: str, size: int) -> None:
-    assert command._bytes(text) == size
+    assert command.size_in_bytes(text) == size
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--memory",
-        type=_bytes,
-        default=_bytes("2GB"),
+        type=size_in_bytes,
+        default=size_in_bytes("2GB"),
         metavar="SIZE",
         help="memory that the model may take, such as 2GB or 500MB; larger images are tiled, and sequences "
         "cut, which changes no result (default: 2GB)",
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     from trainer.samples import fill, return_layers
     from trainer.sequences import denoiser_of
 
-    _check_device(args.device)
+    check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
     wanted = Wanted(args.output, args.png, args.attention is not None, args.aux, args.layers)
@@ -182,7 +182,8 @@ def _pixel(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _bytes(text: str) -> int:
+def size_in_bytes(text: str) -> int:
+    """Return the bytes that a text such as `2GB` means, for options."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmg]?i?)b?", text.strip().lower())
     if match is None or match[2] not in _UNITS or not float(match[1]) > 0:
         raise argparse.ArgumentTypeError(
@@ -198,7 +199,8 @@ def _refuse_inputs(items: list[Item], outputs: list[Path]) -> None:
             raise ValueError(f"{path} is an input; choose another --output")
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Raise a ValueError unless there is such a device."""
     import torch
 
     try:

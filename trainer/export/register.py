@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import re
@@ -10,14 +11,19 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 import onnx
+import torch
+from torch import nn
 
 from data.buffers import SAMPLES, buffer, sample_channels
 from trainer.export.artifact import Artifact, load_artifact
 from trainer.export.entry import Sampled, default, example
+
+if TYPE_CHECKING:
+    from mlflow.tracking import MlflowClient
 
 EXAMPLE_SIZE = (24, 32)
 """Height and width of the input example."""
@@ -26,7 +32,13 @@ EXAMPLE_SAMPLES = 4
 """Samples per pixel, where they are kept apart."""
 
 
-def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri: str) -> str:
+WEIGHTS_TAG = "penumbra.weights"
+"""Tag of a logged model that tells which weights it has."""
+
+
+def log_and_register(
+    run_id: str, onnx_path: Path | str, name: str, tracking_uri: str, weights: str = ""
+) -> str:
     """Log an exported ONNX file with a run and register it as a new version of a model.
 
     The signature lists the buffers with free batch, height, width and number of samples, and `exposure`:
@@ -40,6 +52,7 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
         onnx_path: What `trainer.export.export` wrote.
         name: Name of the registered model.
         tracking_uri: Store of the run and of the registry.
+        weights: Which weights these are, as `weights_of` says it; `registered_version` finds them.
 
     Returns:
         The new version's number, as in `models:/<name>/<version>`.
@@ -49,7 +62,7 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
     """
     import mlflow.onnx
 
-    from trainer.tracking import quiet_mlflow
+    from trainer.spool.store import quiet_mlflow
 
     quiet_mlflow()
     artifact = load_artifact(onnx_path)
@@ -65,9 +78,27 @@ def log_and_register(run_id: str, onnx_path: Path | str, name: str, tracking_uri
             pip_requirements=[f"onnxruntime>={artifact.description.versions['onnxruntime']}", "numpy"],
             save_as_external_data=False,
             run_id=run_id,
-            model_id=_logged_model(run_id, name),
+            model_id=_logged_model(run_id, name, weights),
         )
     return str(info.registered_model_version)
+
+
+def registered_version(client: MlflowClient, run_id: str, name: str, weights: str) -> str | None:
+    """Return the version of a registered model that a run made of these weights, None if there is none."""
+    for version in client.search_model_versions(f"name = '{name}' and run_id = '{run_id}'"):
+        model = version.model_id or (version.source or "").removeprefix("models:/")
+        if client.get_logged_model(model).tags.get(WEIGHTS_TAG) == weights:
+            return str(version.version)
+    return None
+
+
+def weights_of(net: nn.Module) -> str:
+    """Return a name for a network's weights: the same for the same numbers."""
+    digest = hashlib.sha256()
+    for key, value in sorted(net.state_dict().items()):
+        digest.update(key.encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:32]
 
 
 _REGISTERED = re.compile(
@@ -146,14 +177,23 @@ def using_store(uri: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _logged_model(run_id: str, name: str) -> str:
-    """Create the model's entry in the experiment of its run; MLflow would take the default experiment."""
+def _logged_model(run_id: str, name: str, weights: str) -> str:
+    """Create the model's entry in the experiment of its run; MLflow would take the default experiment.
+
+    An entry that an interrupted registration left is removed.
+    """
     from mlflow.tracking import MlflowClient
 
     client = MlflowClient()
     run = client.get_run(run_id)
+    experiment = run.info.experiment_id
+    tags = {WEIGHTS_TAG: weights} if weights else {}
+    if weights:
+        found = f"source_run_id = '{run_id}' AND tags.`{WEIGHTS_TAG}` = '{weights}'"
+        for stale in client.search_logged_models([experiment], found):
+            client.delete_logged_model(stale.model_id)
     model = client.create_logged_model(
-        run.info.experiment_id, name=name, source_run_id=run_id, params=dict(run.data.params)
+        experiment, name=name, source_run_id=run_id, params=dict(run.data.params), tags=tags
     )
     return str(model.model_id)
 

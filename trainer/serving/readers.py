@@ -1,0 +1,178 @@
+"""The pool of processes that decode uploaded files."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import select
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from data.frame import Frame
+from trainer.serving.limits import Limits, Over, Refusal, Ticket
+from trainer.serving.reader import argument, command
+from trainer.serving.wire import MAX_LINE, Parcel, receive, unpack
+
+_PATIENCE = 0.05
+_PASSED_ON = ("PATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TZ")
+
+
+class Readers:
+    """Decodes uploaded files in processes of their own.
+
+    Args:
+        count: Processes.
+        limits: Of a request; a process has the memory that the largest frame needs, and no more.
+    """
+
+    def __init__(self, count: int, limits: Limits) -> None:
+        self.limits, self.deaths = limits, 0
+        self._idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        self._all: set[_Process] = set()
+        for _ in range(count):
+            self._idle.put(self._start())
+
+    def frames(self, folder: Path, name: str, ticket: Ticket) -> list[dict[str, Any]]:
+        """Return `name` and `bytes` of each frame of an uploaded file, which is unpacked where it is a ZIP.
+
+        Raises:
+            Refusal: The file is damaged or hostile.
+            Over: Nobody waits for the result any more.
+        """
+        parcel = self._ask({"what": "list", "folder": str(folder), "name": name}, ticket)
+        return list(parcel.values["frames"])
+
+    def read(
+        self, folder: Path, name: str, layers: Mapping[str, str], ticket: Ticket
+    ) -> tuple[Frame, list[str]]:
+        """Return a frame and the remarks of its reader; raises as `list`."""
+        what = {"what": "read", "folder": str(folder), "name": name, "layers": dict(layers)}
+        return unpack(self._ask(what, ticket))
+
+    def close(self) -> None:
+        """End all processes."""
+        for process in list(self._all):
+            process.end()
+        self._all.clear()
+
+    def _start(self) -> _Process:
+        process = _Process(self.limits)
+        self._all.add(process)
+        return process
+
+    def _ask(self, request: Mapping[str, Any], ticket: Ticket) -> Parcel:
+        with self._process(ticket) as process:
+            parcel = process.ask(request, ticket)
+        if "error" in parcel.values:
+            raise Refusal(422, parcel.values["error"])
+        return parcel
+
+    def _free(self, ticket: Ticket) -> _Process:
+        while True:
+            ticket.check()
+            try:
+                return self._idle.get(timeout=_PATIENCE)
+            except queue.Empty:
+                continue
+
+    @contextmanager
+    def _process(self, ticket: Ticket) -> Iterator[_Process]:
+        """Lend a process; one that was given up is replaced."""
+        process = self._free(ticket)
+        try:
+            yield process
+        except BaseException:
+            # It died, hangs, or is in the middle of something that nobody wants any more.
+            process.end()
+            self._all.discard(process)
+            self.deaths += 1
+            process = self._start()
+            raise
+        finally:
+            self._idle.put(process)
+
+
+class _Process:
+    """One process and the pipes to it."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+        environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+        # Secrets of the server are none of its business; threads of libraries would take address space.
+        environment |= {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
+                        "MALLOC_ARENA_MAX": "2"}  # fmt: skip
+        self._process = subprocess.Popen(
+            [*command(), argument(limits)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, env=environment, start_new_session=True, bufsize=0,
+        )  # fmt: skip
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._stdin, self._out = self._process.stdin, self._process.stdout.fileno()
+        os.set_blocking(self._out, False)
+        self._held = b""
+
+    def ask(self, request: Mapping[str, Any], ticket: Ticket) -> Parcel:
+        """Return the answer to a request.
+
+        Raises:
+            Refusal: The process died or took too long.
+            Over: Nobody waits for the result any more.
+        """
+        until = time.monotonic() + self.limits.decode
+        try:
+            self._stdin.write(json.dumps(request).encode() + b"\n")
+            return receive(
+                lambda: self._line(until, ticket),
+                lambda view: self._fill(view, until, ticket),
+                2 * self.limits.frame_bytes,
+            )
+        except (BrokenPipeError, EOFError, ValueError, KeyError, TypeError):
+            raise Refusal(
+                422, "the file made the reader of EXR files fail: it is damaged, or made to; render it again"
+            ) from None
+
+    def end(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        self._stdin.close()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def _wait(self, until: float, ticket: Ticket) -> None:
+        """Wait until there is something to read."""
+        while not select.select([self._out], [], [], _PATIENCE)[0]:
+            if ticket.over:
+                raise Over
+            if time.monotonic() > until:
+                raise Refusal(
+                    422, f"the file could not be decoded within {self.limits.decode:g} seconds; it is damaged"
+                )
+
+    def _line(self, until: float, ticket: Ticket) -> bytes:
+        while b"\n" not in self._held:
+            self._wait(until, ticket)
+            piece = os.read(self._out, 1 << 16)
+            if not piece or len(self._held) > MAX_LINE:
+                raise EOFError
+            self._held += piece
+        line, _, self._held = self._held.partition(b"\n")
+        return line
+
+    def _fill(self, view: memoryview, until: float, ticket: Ticket) -> None:
+        start = min(len(view), len(self._held))
+        view[:start] = self._held[:start]
+        self._held = self._held[start:]
+        while start < len(view):
+            self._wait(until, ticket)
+            got = os.readv(self._out, [view[start:]])
+            if not got:
+                raise EOFError
+            start += got
