@@ -127,7 +127,11 @@ def _run(verb: str, arguments: list[str]) -> int:
     command = importlib.import_module(f"trainer.commands.{verb}")
     parser = argparse.ArgumentParser(prog=f"trainer {verb}", description=command.HELP)
     command.add_arguments(parser)
-    code: int = command.run(parser.parse_args(arguments))
+    if getattr(command, "PASSES_ON", False):  # options that it does not know are another command's
+        args, args.rest = parser.parse_known_args(arguments)
+    else:
+        args = parser.parse_args(arguments)
+    code: int = command.run(args)
     return code
 
 

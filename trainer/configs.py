@@ -6,6 +6,8 @@ import difflib
 from pathlib import Path
 
 DEFAULTS = "defaults.yaml"
+SEARCH = "search"
+"""Folder of what `trainer tune` varies; those files are no configurations."""
 
 
 class UsageError(ValueError):
@@ -22,7 +24,11 @@ def folder() -> Path:
 def names() -> list[str]:
     """Return the names that `--config` accepts without a path."""
     base = folder()
-    return sorted(str(p.relative_to(base)) for p in base.rglob("*.yaml") if p.name != DEFAULTS)
+    return sorted(
+        str(p.relative_to(base))
+        for p in base.rglob("*.yaml")
+        if p.name != DEFAULTS and p.parent.name != SEARCH
+    )
 
 
 def resolve(name: str) -> str:

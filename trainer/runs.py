@@ -93,7 +93,7 @@ def run_folders(root: Path, experiment: str) -> list[Path]:
 
 
 def find_checkpoint(word: str, root: Path, experiment: str) -> Path:
-    """Return the checkpoint that `word` means: `last`, `best`, a run folder or a file.
+    """Return the checkpoint that `word` means: `last`, `best`, a run folder or a file, or the URL of one.
 
     `last` and `best` are taken from the newest run of the experiment that has such a checkpoint.
 
@@ -109,6 +109,10 @@ def find_checkpoint(word: str, root: Path, experiment: str) -> Path:
             f"--ckpt_path {word}: no run of {experiment!r} below {root / experiment} has a {word} "
             "checkpoint; give the path of a checkpoint, or leave the option out to start anew"
         )
+    if "://" in word:
+        from trainer.cluster.storage import fetch_checkpoint
+
+        return fetch_checkpoint(word, root)
     path = Path(word)
     if path.is_dir():
         path = path / "checkpoints" / "last.ckpt"

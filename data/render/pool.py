@@ -11,11 +11,12 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
+from data.jobs import Job, Runner, elsewhere
 from data.render.recipe import Recipe
 from data.render.sources import Source
 from data.render.variant import Variant, activate
-from data.render.views import ViewWork
-from data.render.worker import Task, render_task, speed_of, start
+from data.render.views import WORK, ViewWork
+from data.render.worker import Task, render_alone, render_task, speed_of, start
 
 Report = Callable[[int, str], None]
 
@@ -37,6 +38,9 @@ def work_on(tasks: list[Task], processes: int, variant: Variant, threads: int, r
         ValueError: A scene cannot be rendered, or a process died.
         OSError: A file cannot be written.
     """
+    if runner := elsewhere():
+        _work_elsewhere(runner, tasks, variant, report)
+        return
     context = multiprocessing.get_context("spawn")  # the renderer keeps threads, which no fork survives
     reports = context.Queue()
     pool = ProcessPoolExecutor(
@@ -53,6 +57,26 @@ def work_on(tasks: list[Task], processes: int, variant: Variant, threads: int, r
     except BaseException:
         _end(pool)
         raise
+
+
+def _work_elsewhere(runner: Runner, tasks: list[Task], variant: Variant, report: Report) -> None:
+    jobs = [
+        Job(
+            f"scene {task.source.name}, views {task.works[0].view} to {task.works[-1].view}",
+            render_alone,
+            (task, variant, runner.cores),
+            (task.works[0].root / WORK,),
+        )
+        for task in tasks
+    ]
+    label = "starting"
+
+    def done(job: Job | None, samples: int | None) -> None:
+        nonlocal label
+        label = job.name if job is not None else label
+        report(samples or 0, label)
+
+    runner(jobs, done)
 
 
 def tasks_of(busy: Sequence[tuple[Source, list[ViewWork]]], processes: int) -> Iterator[Task]:

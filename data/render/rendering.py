@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from data.jobs import elsewhere
 from data.manifest import MANIFEST, FrameRecord, Manifest, SceneRecord, make_splits, write_json
 from data.render.output import bytes_of, check_room, examine, prepare
 from data.render.pool import measure_speed, tasks_of, work_on
@@ -175,7 +176,8 @@ def _work(
 ) -> None:
     """Render what is missing, report it, and remember how fast it was."""
     busy = [(source, todo.unfinished[source.name]) for source in sources if source.name in todo.unfinished]
-    tasks = list(tasks_of(busy, options.processes))
+    runner = elsewhere()
+    tasks = list(tasks_of(busy, runner.workers if runner else options.processes))
     done, began = todo.samples - todo.missing, time.monotonic()
 
     def report(count: int, label: str) -> None:

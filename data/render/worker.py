@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
+from queue import SimpleQueue
 from typing import Any
 
 from data.render.recipe import Recipe
@@ -37,7 +38,7 @@ def start(variant: Variant, threads: int, reports: Any, parent: int) -> None:
     threading.Thread(target=_follow, args=(parent,), daemon=True).start()
     activate(variant, threads)
     _Process.reports = reports
-    _Process.renderer = f"Mitsuba {version('mitsuba')} ({variant.name})"
+    _Process.renderer = _renderer(variant)
 
 
 def render_task(task: Task) -> None:
@@ -57,6 +58,24 @@ def render_task(task: Task) -> None:
             render_view(work, tracer, _Process.renderer, partial(_report, label=label))
     except RuntimeError as error:
         raise _failed(task.source, error) from error
+
+
+def render_alone(task: Task, variant: Variant, threads: int) -> int:
+    """Render the views of a task in a process that no other of this machine waits for.
+
+    Returns:
+        The samples that were traced.
+
+    Raises:
+        ValueError: The scene cannot be made or rendered; the message names it.
+        OSError: A file cannot be written.
+    """
+    activate(variant, threads)
+    reports: SimpleQueue[tuple[int, str]] = SimpleQueue()
+    _Process.reports = reports
+    _Process.renderer = _renderer(variant)
+    render_task(task)
+    return sum(reports.get()[0] for _ in range(reports.qsize()))
 
 
 def speed_of(source: Source, recipe: Recipe) -> float:
@@ -90,6 +109,10 @@ def _speed(source: Source, recipe: Recipe) -> float:
 def _report(count: int, label: str) -> None:
     """Tell the parent what was done."""
     _Process.reports.put((count, label))
+
+
+def _renderer(variant: Variant) -> str:
+    return f"Mitsuba {version('mitsuba')} ({variant.name})"
 
 
 def _follow(parent: int) -> None:

@@ -3,6 +3,7 @@
 from trainer.callbacks.checkpoints import AtomicCheckpointIO, BestCheckpoint, LastCheckpoint
 from trainer.callbacks.exporting import ExportBest
 from trainer.callbacks.finite import FiniteGuard
+from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.pictures import ValidationPictures
 from trainer.callbacks.progress import TrainingProgress
 
@@ -12,6 +13,7 @@ __all__ = [
     "ExportBest",
     "FiniteGuard",
     "LastCheckpoint",
+    "MirrorRun",
     "TrainingProgress",
     "ValidationPictures",
 ]

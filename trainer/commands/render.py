@@ -95,6 +95,21 @@ def _image_arguments(group: Any) -> None:
     )
 
 
+def check(args: argparse.Namespace) -> None:
+    """Check the options alone; nothing is read or rendered.
+
+    Raises:
+        UsageError: Some do not fit.
+    """
+    from trainer.configs import UsageError
+
+    try:
+        _check(args)
+        _recipe(args)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 def run(args: argparse.Namespace) -> int:
     """Render, or print what would be; returns 0, or 1 where a noisy mean is not that of its reference.
 
@@ -105,14 +120,10 @@ def run(args: argparse.Namespace) -> int:
     """
     from data.render.rendering import RenderOptions, render
     from data.render.variant import choose
-    from trainer.configs import UsageError
     from trainer.progress import sample_progress
 
-    try:
-        _check(args)
-        recipe = _recipe(args)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    check(args)
+    recipe = _recipe(args)
     sources = _sources(args, recipe)
     variant = choose(VARIANTS[args.variant])
     print(f"Mitsuba's variant: {variant.reason}", flush=True)

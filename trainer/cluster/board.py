@@ -1,0 +1,130 @@
+"""What the processes of a job tell the one who waits for it: lines, the outcome, and whether to go on."""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any
+
+POLL_S = 0.25
+"""Seconds between two looks at the board."""
+
+PATIENCE_S = 45.0
+"""Seconds that a cancelled job gets to end by itself."""
+
+
+class Board:
+    """Lines and outcome of one job; lives in the cluster as an actor."""
+
+    def __init__(self) -> None:
+        self._lines: list[tuple[str, str]] = []
+        self._outcome: tuple[int, str] | None = None
+        self._cancelled = False
+
+    def write(self, stream: str, text: str) -> None:
+        """Add text for `stdout` or `stderr`."""
+        self._lines.append((stream, text))
+
+    def read(self, start: int) -> tuple[list[tuple[str, str]], tuple[int, str] | None]:
+        """Return the texts from a number on, and the outcome where there is one."""
+        return self._lines[start:], self._outcome
+
+    def end(self, code: int, message: str = "") -> None:
+        """Set exit code and message; the first one counts."""
+        self._outcome = self._outcome or (code, message)
+
+    def cancel(self) -> None:
+        """Ask the job to stop."""
+        self._cancelled = True
+
+    def cancelled(self) -> bool:
+        """Return whether the job shall stop."""
+        return self._cancelled
+
+
+class _Sender(io.TextIOBase):
+    """A text stream whose lines go to a board."""
+
+    def __init__(self, board: Any, stream: str) -> None:
+        self._board, self._stream, self._rest = board, stream, ""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, text: str, /) -> int:
+        whole, newline, self._rest = (self._rest + text).rpartition("\n")
+        if newline:
+            self._board.write.remote(self._stream, whole + newline)
+        return len(text)
+
+    def flush(self) -> None:
+        """Keep the beginning of a line until its end comes."""
+
+    def finish(self) -> None:
+        """Send what has no end of line."""
+        if self._rest:
+            self._board.write.remote(self._stream, self._rest + "\n")
+            self._rest = ""
+
+
+@contextmanager
+def sending(board: Any) -> Iterator[None]:
+    """Send what this process prints to a board."""
+    streams = _Sender(board, "stdout"), _Sender(board, "stderr")
+    with redirect_stdout(streams[0]), redirect_stderr(streams[1]):
+        try:
+            yield
+        finally:
+            for stream in streams:
+                stream.finish()
+
+
+def follow(ray: Any, board: Any, job: Any) -> tuple[int, str]:
+    """Print what a job writes until it has ended; returns its exit code and message.
+
+    Args:
+        ray: The connected module.
+        board: The job's board.
+        job: Reference to the result of the call that does the job.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; the job was asked to stop and had time for it.
+    """
+    seen = 0
+
+    def look() -> tuple[int, str] | None:
+        nonlocal seen
+        lines, outcome = ray.get(board.read.remote(seen))
+        seen += len(lines)
+        for stream, text in lines:
+            print(text, end="", file=getattr(sys, stream), flush=True)
+        return outcome
+
+    def wait(seconds: float) -> tuple[int, str] | None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            done, _ = ray.wait([job], timeout=POLL_S)
+            outcome = look()
+            if outcome is not None:
+                return outcome
+            if done:
+                ray.get(job)  # raises what made it end
+                return look() or (1, "the job ended without an outcome")
+        return None
+
+    try:
+        while True:
+            outcome = wait(3600)
+            if outcome is not None:
+                return outcome
+    except ray.exceptions.RayError as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        return 1, f"the process that conducts the job was lost: {lines[0][:300]}"
+    except KeyboardInterrupt:
+        print("cancelling the job (again Ctrl-C: at once)", file=sys.stderr, flush=True)
+        ray.get(board.cancel.remote())
+        wait(PATIENCE_S)
+        raise

@@ -1,0 +1,171 @@
+"""Ray, started on this machine or reached in a cluster, and kept as quiet as the commands that use it."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+PACKAGE = "penumbra-denoise"
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # future behaviour, without the warning about it
+    "RAY_TRAIN_ENABLE_PRINT_PATCH": "0",
+    "RAY_TRAIN_METRICS_ENABLED": "0",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",
+    "RAY_TRAIN_HEALTH_CHECK_INTERVAL_S": "0.5",
+    "RAY_TRAIN_WORKER_GROUP_START_TIMEOUT_S": "300",
+    "RAY_AIR_NEW_OUTPUT": "0",
+    "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
+}
+"""Variables of Ray: no usage statistics, no lines of its own, no changes of the working directory."""
+
+FORWARDED = ("MLFLOW_", "AWS_", "PENUMBRA_", "OMP_")
+"""Beginnings of the variables that the processes of a job get from the submitting shell."""
+
+OBJECT_STORE = 200 * 1024**2
+"""Bytes of shared memory of a Ray that is started here; checkpoints of a restart pass through it."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where a job runs.
+
+    Attributes:
+        address: Address of a running Ray (`ray://…`, `auto`, `host:port`); None: one is started here.
+        cpus: Processor cores that the job needs in all, for a Ray that is started here.
+        gpus: The same for GPUs.
+    """
+
+    address: str | None = None
+    cpus: int = 1
+    gpus: float = 0
+
+
+def need_ray() -> None:
+    """Raise a ValueError that tells how Ray is installed, where it is not."""
+    missing = [name for name in ("ray", "optuna") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ValueError(f'{" and ".join(missing)} missing: pip install "{PACKAGE}[ray]"')
+
+
+def forwarded(address: str | None) -> dict[str, str]:
+    """Return the variables that a job takes along; caches are the nodes' own in a cluster."""
+    own = () if address is None else ("PENUMBRA_CACHE",)
+    return {k: v for k, v in os.environ.items() if k.startswith(FORWARDED) and k not in own}
+
+
+@contextmanager
+def connected(cluster: Cluster) -> Iterator[Any]:
+    """Yield the module `ray`, connected; what was started here is ended.
+
+    Raises:
+        ValueError: Ray is missing, or the nodes have another release of Penumbra or none.
+        OSError: Nothing answers at the address.
+    """
+    need_ray()
+    os.environ.update({key: value for key, value in QUIET.items() if key not in os.environ})
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    import ray
+
+    begin = _start if cluster.address is None else _reach
+    begin(ray, cluster)
+    try:
+        _check_release(ray)
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _start(ray: Any, cluster: Cluster) -> None:
+    os.environ.pop("RAY_ADDRESS", None)  # it would win over "local"
+    # On one machine Ray would end processes of the job because others' have filled the memory.
+    os.environ.setdefault("RAY_memory_monitor_refresh_ms", "0")
+    cores = max(len(os.sched_getaffinity(0)), cluster.cpus)
+    print(f"starting Ray on this machine ({cores} CPUs)", file=sys.stderr, flush=True)
+    try:
+        ray.init(
+            address="local",
+            num_cpus=cores,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            configure_logging=True,
+            object_store_memory=OBJECT_STORE,
+            _node_ip_address="127.0.0.1",  # its servers then listen on the loopback interface alone
+        )
+    except Exception as error:  # Ray raises the bare class where its processes do not come up
+        reason = str(error).strip().splitlines()[0][:200]
+        raise OSError(f"Ray does not start on this machine, perhaps for want of memory: {reason}") from error
+
+
+def _reach(ray: Any, cluster: Cluster) -> None:
+    address = str(cluster.address)
+    print(f"connecting to Ray at {address}", file=sys.stderr, flush=True)
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    try:
+        ray.init(address=address, **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0][:200]
+        raise OSError(f"--address {address}: no Ray cluster can be used there: {reason}") from None
+    have = ray.cluster_resources()
+    for kind, wanted in (("CPU", cluster.cpus), ("GPU", cluster.gpus)):
+        if have.get(kind, 0) < wanted:
+            print(
+                f"note: the job needs {wanted:g} {kind}s and the cluster has {have.get(kind, 0):g}; it waits "
+                "until nodes join (Ctrl-C gives up)",
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+def release() -> str:
+    """Return the installed release of Penumbra."""
+    return metadata.version(PACKAGE)
+
+
+def _check_release(ray: Any) -> None:
+    """Raise a ValueError unless the cluster has this release of Penumbra."""
+    try:
+        found = ray.get(ray.remote(num_cpus=0)(_installed).remote(PACKAGE))
+    except ray.exceptions.RayError as error:
+        raise ValueError(f"the cluster cannot run a task: {str(error).splitlines()[0]}") from None
+    if found != release():
+        raise ValueError(
+            f"the cluster has {PACKAGE} {found or 'not installed'}, this machine {release()}; start its "
+            "nodes from an image or environment with the same release"
+        )
+
+
+def _installed(package: str) -> str | None:
+    from importlib import metadata
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def enter(folder: str, environment: dict[str, str]) -> None:
+    """Let this process of a cluster work in a folder and with the submitter's variables.
+
+    Raises:
+        OSError: The folder cannot be made on this node.
+    """
+    os.environ.update(QUIET | environment)
+    logging.getLogger("ray").setLevel(logging.CRITICAL)  # what matters is told by the commands themselves
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        os.chdir(folder)
+    except OSError as error:
+        raise OSError(
+            f"the folder {folder} cannot be used on node {os.uname().nodename} ({error.strerror}); give "
+            "--folder DIR"
+        ) from None
