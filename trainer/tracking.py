@@ -1,105 +1,49 @@
-"""MLflow tracking that needs no server and survives the loss of one.
+"""MLflow tracking that training never waits for.
 
-Without a server everything goes to a local store (`runs/mlflow.db`). With one (`MLFLOW_TRACKING_URI` or the
-option `tracking_uri`) runs go there; when it cannot be reached, or breaks away later, training goes on with
-the local store, says so once, and `trainer upload` sends the rest afterwards.
+What a run records goes into a journal in its folder (`trainer.spool`), at once and in order, and a thread
+sends it to the tracking store: the server of `MLFLOW_TRACKING_URI` or of the option `tracking_uri`, or else
+a local database (`runs/mlflow.db`). A server may be slow, restart, or be away for days; what it does not have
+at the end of a run is sent when the run is continued, or by `trainer sync`.
 """
 
 from __future__ import annotations
 
-import logging
-import os
+import atexit
+import io
 import re
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+import threading
+import uuid
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from trainer.runs import RunRecord, new_folder
+from trainer.runs import RUN_FILE, RunRecord, new_folder
+from trainer.spool.delivery import LIMITS
+from trainer.spool.journal import Event, Journal, Recorded, number
+from trainer.spool.machine import Sampler
+from trainer.spool.sender import Sender, wait_for
+from trainer.spool.store import (
+    described,
+    experiment_id,
+    is_server,
+    load_mlflow,
+    local_store,
+    open_client,
+    quiet_mlflow,
+    tracking_uri,
+)
 
 if TYPE_CHECKING:
-    from mlflow.entities import Run
-    from mlflow.tracking import MlflowClient
     from PIL.Image import Image
 
-T = TypeVar("T")
-RUNS = Path("runs")
-
-
-def local_store(root: Path) -> str:
-    """Return the URI of the local store below `root`, creating the folder."""
-    root.mkdir(parents=True, exist_ok=True)
-    database = root / "mlflow.db"
-    if not os.access(database if database.exists() else root, os.W_OK):
-        # MLflow would try again for minutes.
-        raise PermissionError(f"the local tracking store {database} cannot be written")
-    return f"sqlite:///{(root / 'mlflow.db').resolve()}"
-
-
-def tracking_uri(given: str | None, root: Path = RUNS) -> str:
-    """Return the store to use: the given one, `MLFLOW_TRACKING_URI`, or the local one."""
-    return given or os.environ.get("MLFLOW_TRACKING_URI") or local_store(root)
-
-
-def is_server(uri: str) -> bool:
-    """Return whether a store is reached over the network."""
-    return uri.startswith(("http://", "https://"))
-
-
-def unreachable(uri: str, timeout_s: float = 5.0) -> str | None:
-    """Return why a tracking server cannot be used, None if it answers.
-
-    Connection errors, timeouts and statuses from 500 count; a request that is refused does not.
-    """
-    import requests
-
-    try:
-        answer = requests.get(f"{uri.rstrip('/')}/health", timeout=timeout_s)
-    except requests.RequestException as error:
-        return type(error).__name__
-    # A proxy may hide or protect the path (401, 403, 404): it answers, so the server is there.
-    return f"HTTP status {answer.status_code}" if answer.status_code >= 500 else None
-
-
-def quiet_mlflow() -> None:
-    """Keep MLflow's set-up messages off the terminal and its retries short."""
-    for name in ("mlflow", "alembic"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    # It logs every database error with its traceback, and raises it as well.
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
-    # Seven retries with doubling waits would stop training for minutes when a server goes away.
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "30")
-    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-
-
-def open_client(uri: str) -> MlflowClient:
-    """Return a client of a store; the local store is created if absent."""
-    quiet_mlflow()
-    from mlflow.tracking import MlflowClient
-
-    return MlflowClient(tracking_uri=uri, registry_uri=uri)
-
-
-def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
-    """Return the identifier of an experiment, creating it if absent.
-
-    In a local store its artifacts lie beside the database, not below the current directory.
-    """
-    found = client.get_experiment_by_name(name)
-    if found is not None:
-        return str(found.experiment_id)
-    location = None
-    if uri.startswith("sqlite:///"):
-        location = (Path(uri.removeprefix("sqlite:///")).parent / "artifacts" / name).as_uri()
-    # The kind chooses what the experiment's page shows; without it MLflow takes us for a language model.
-    tags = {"mlflow.experimentKind": "custom_model_development"}
-    return str(client.create_experiment(name, artifact_location=location, tags=tags))
+__all__ = ["MLflowTracking", "experiment_id", "is_server", "local_store", "open_client", "quiet_mlflow",
+           "tracking_uri"]  # fmt: skip
+INTERRUPTED_WAIT_S = 15.0
+"""How long a run that failed or was interrupted waits for its server at the end."""
 
 
 class MLflowTracking(Logger):
@@ -132,13 +76,13 @@ class MLflowTracking(Logger):
         self.root = Path(root)
         self.system_metrics = system_metrics
         self.resume_from = Path(resume_from) if resume_from else None
-        self._keeps_status = False
         self.evaluation = evaluation
         self._folder: Path | None = None
-        self._record: RunRecord | None = None
-        self._client: MlflowClient | None = None
-        self._monitor: Any = None
-        self._params: set[str] = set()
+        self._journal: Journal | None = None
+        self._recorded = Recorded()
+        self._sender: Sender | None = None
+        self._sampler: Sampler | None = None
+        self._lock = threading.Lock()
 
     @property
     def name(self) -> str:
@@ -187,187 +131,216 @@ class MLflowTracking(Logger):
 
     @property
     def record(self) -> RunRecord:
-        """The run's record, after the run was opened."""
-        self.client()
-        assert self._record is not None
-        return self._record
+        """The run's record as it is now; its `run_id` is None until the store has answered."""
+        if not (self.folder / RUN_FILE).exists():
+            self._open()
+        return RunRecord.load(self.folder)
 
     @property
     def run_id(self) -> str:
-        """Identifier of the MLflow run."""
+        """Identifier of the MLflow run, empty until the store has answered."""
         return self.record.run_id or ""
 
     @property
     def uri(self) -> str:
-        """Store that the run is in at present."""
+        """Store that the run is sent to."""
         return self.record.tracking_uri or ""
-
-    def client(self) -> MlflowClient:
-        """Return the client, opening or continuing the run on first use."""
-        if self._client is None:
-            self._open()
-        assert self._client is not None
-        return self._client
-
-    def call(self, action: Callable[[MlflowClient, str], T]) -> T:
-        """Do `action(client, run_id)`; if the server breaks away, do it in the local store instead."""
-        from mlflow.exceptions import MlflowException
-
-        try:
-            return action(self.client(), self.run_id)
-        except (MlflowException, OSError) as error:
-            if not is_server(self.uri) or unreachable(self.uri) is None:
-                raise
-            self._fall_back(self.uri, type(error).__name__, self.run_id)
-            return action(self.client(), self.run_id)
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log numbers at a global step."""
-        from mlflow.entities import Metric
+        """Record numbers at a global step, unless they are recorded already.
 
-        now = int(time.time() * 1000)
-        entries = [
-            Metric(re.sub(r"[^\w/. -]", "_", key), float(value), now, step or 0)
+        Of a step that is trained again after a kill the first numbers stay. Only an evaluation records
+        another number at a step that has one.
+        """
+        step = step or 0
+        values = {
+            re.sub(r"[^\w/. -]", "_", key): float(value)
             for key, value in metrics.items()
             if isinstance(value, (int, float))
-        ]
-        self.call(lambda client, run: client.log_batch(run, metrics=entries))
+        }
+        self._open()
+        known = self._recorded.has_equal if self.evaluation else self._known
+        new = {key: number(value) for key, value in values.items() if not known(key, step, value)}
+        if new:
+            self._append({"type": "metrics", "step": step, "values": new})
+
+    def _known(self, key: str, step: int, value: float) -> bool:
+        return self._recorded.has_value(key, step)
 
     @rank_zero_only
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
         """Ignore Lightning's own call: the resolved configuration is recorded by `RunRecorder`."""
 
-    @rank_zero_only
-    def log_params(self, params: Mapping[str, Any]) -> None:
-        """Log parameters that the run does not have yet; a resumed run keeps its first values."""
-        from mlflow.entities import Param
+    def log_params(self, params: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+        """Record parameters; one that is recorded keeps its first value, as MLflow demands.
 
-        if not self._params:
-            self._params = set(self.call(lambda c, run: c.get_run(run)).data.params)
-        new = [Param(key, str(value)[:500]) for key, value in params.items() if key not in self._params]
-        for start in range(0, len(new), 100):
-            self.call(partial(_log_params, new[start : start + 100]))
-        self._params.update(params)
+        Returns:
+            What differs: the first value and the given one by name.
+        """
+        if not _first_rank():
+            return {}
+        self._open()
+        texts = {key: str(value)[: LIMITS["params"]] for key, value in params.items()}
+        first = self._recorded.params
+        if new := {key: text for key, text in texts.items() if key not in first}:
+            self._append({"type": "params", "values": new})
+        return {key: (first[key], text) for key, text in texts.items() if first[key] != text}
 
     @rank_zero_only
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Set tags of the run."""
-        for key, value in tags.items():
-            self.call(partial(_set_tag, key, value))
+        self._open()
+        self._append({"type": "tags", "values": {key: str(value) for key, value in tags.items()}})
 
     @rank_zero_only
     def log_file(self, path: Path, folder: str | None = None) -> None:
-        """Store a file with the run."""
-        self.call(lambda client, run: client.log_artifact(run, str(path), folder))
+        """Store a file with the run, as it is now."""
+        to = f"{folder}/{path.name}" if folder else path.name
+        self._append_new({"type": "file", "to": to, **self._opened().keep(path)})
 
     @rank_zero_only
     def log_text(self, text: str, file: str) -> None:
         """Store a text file with the run."""
-        self.call(lambda client, run: client.log_text(run, text, file))
+        kept = self._opened().keep_bytes(text.encode(), Path(file).name)
+        self._append_new({"type": "file", "to": file, **kept})
 
     @rank_zero_only
     def log_picture(self, picture: Image, key: str, step: int) -> None:
         """Store a picture as one step of a series that the run's page can play."""
-        self.call(lambda client, run: client.log_image(run, picture, key=key, step=step))
+        event: Event = {"type": "picture", "key": re.sub(r"[^\w/. -]", "_", key), "step": step}
+        self._open()
+        if not self._recorded.has(event):
+            data = io.BytesIO()
+            picture.save(data, "png")
+            self._append(event | self._opened().keep_bytes(data.getvalue(), "picture.png"))
+
+    @rank_zero_only
+    def log_model(self, path: Path, name: str, weights: str) -> None:
+        """Register an exported ONNX file as a version of a model, once for the same weights.
+
+        Args:
+            path: What `trainer.export.export` wrote.
+            name: Name of the registered model.
+            weights: Which weights these are, as `trainer.export.register.weights_of` says it.
+        """
+        import mlflow.onnx  # noqa: F401  # see `load_mlflow`
+
+        event: Event = {"type": "model", "name": name, "weights": weights}
+        self._open()
+        if not self._recorded.has(event):
+            self._append(event | self._opened().keep(path))
+
+    def after_save_checkpoint(self, checkpoint_callback: Any) -> None:
+        """Write down what waits for disk space, since the run would continue behind it."""
+        if self._journal is not None and not self._journal.flush():
+            raise OSError(
+                f"cannot write {self._journal.path}: the disk is full; continue with --ckpt_path last"
+            )
+
+    def flush(self, wait_s: float | None = None) -> int:
+        """Wait until the store has everything; returns the number of events that it does not have.
+
+        Args:
+            wait_s: Longest wait in seconds; as at the end of a run where None.
+        """
+        self._open()
+        assert self._sender is not None
+        return self._sender.drain(wait_for(self.uri) if wait_s is None else wait_s)
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
         """End the run: `success` or `finished` → FINISHED, anything else → FAILED.
 
-        A run that was continued for evaluation keeps its status, which is that of its training.
+        A run that was continued for evaluation keeps its status, which is that of its training. What the
+        store does not take in time stays in the journal.
         """
-        if self._client is None:
+        if self._journal is None:
             return
-        if self._monitor is not None:
-            self._monitor.finish()
-            self._monitor = None
-        if self._keeps_status:
-            return
-        word = "FINISHED" if status in ("success", "finished") else "FAILED"
-        self.call(lambda client, run: client.set_terminated(run, word))
-
-    def _open(self) -> None:
-        if self.resume_from is not None:
-            self._record = RunRecord.load(self.resume_from)
-        uri = tracking_uri(self.given_uri, self.root)
-        if self._record is not None and self._record.tracking_uri:
-            uri = self._record.tracking_uri
-        if is_server(uri) and (reason := unreachable(uri)):
-            self._fall_back(uri, reason, self._record.run_id if self._record else None)
-            return
-        self._client = open_client(uri)
-        if self._record is not None and self._continued(self._client):
-            self._start_monitor(resumed=True)
-            return
-        self._create(uri)
-
-    def _continued(self, client: MlflowClient) -> bool:
-        from mlflow.exceptions import MlflowException
-
-        assert self._record is not None
-        try:
-            if self.evaluation:
-                client.get_run(self._record.run_id or "")
-            else:
-                client.set_terminated(self._record.run_id or "", "RUNNING")
-        except MlflowException:
+        if self._sampler is not None:
+            self._sampler.stop()
+        done = status in ("success", "finished")
+        event: Event = {"type": "status", "status": "FINISHED" if done else "FAILED"}
+        if not self.evaluation or not self._recorded.trained:
+            self._append(event | ({"evaluation": True} if self.evaluation else {}))
+        wait = wait_for(self.uri)
+        rest = self.flush(wait if done else min(wait, INTERRUPTED_WAIT_S))
+        self._close()
+        if rest:
             print(
-                f"The run {self._record.name} is no longer in its store; a new one takes its place.",
+                f"{rest} events of the run are not in {described(self.uri)} yet; "
+                f"`trainer sync {self.folder}` sends them.",
                 file=sys.stderr,
             )
-            return False
-        self._keeps_status = self.evaluation
-        return True
 
-    def _create(self, uri: str, unreached_uri: str | None = None, server_run_id: str | None = None) -> None:
-        client = self._client
-        assert client is not None
-        run: Run = client.create_run(
-            experiment_id(client, uri, self.experiment_name),
-            run_name=self.folder.name,
-            tags={"penumbra.folder": str(self.folder)},
-        )
-        record = RunRecord(
-            self.experiment_name, self.folder.name, uri, run.info.run_id, unreached_uri, server_run_id
-        )
-        record.save(self.folder)
-        self._record = record
-        self._keeps_status = False
-        self._start_monitor(resumed=False)
+    def _opened(self) -> Journal:
+        self._open()
+        assert self._journal is not None
+        return self._journal
 
-    def _fall_back(self, server: str, reason: str, server_run: str | None) -> None:
-        if self._monitor is not None:
-            self._monitor.finish()
-            self._monitor = None
-        uri = local_store(self.root)
-        print(
-            f"The tracking server {server} cannot be reached ({reason}). Training goes on with the local "
-            f"store; send the run later with `trainer upload {self.folder}`.",
-            file=sys.stderr,
-        )
-        self._params.clear()
-        self._client = open_client(uri)
-        self._create(uri, unreached_uri=server, server_run_id=server_run)
-
-    def _start_monitor(self, resumed: bool) -> None:
-        if not self.system_metrics:
+    def _open(self) -> None:
+        """Begin or continue the run, without a word to the server."""
+        if self._journal is not None:
             return
-        from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+        uri = self._begin_record()
+        self._recorded = Recorded.of(self.folder)
+        self._journal = Journal(self.folder, self._recorded.last_ms)
+        if not self._recorded.id:
+            self._append({"type": "run", "id": uuid.uuid4().hex})
+        if not self.evaluation:
+            self._append({"type": "status", "status": "RUNNING"})
+        quiet_mlflow(retries=0)
+        load_mlflow(uri)
+        self._sender = Sender(self.folder, self._journal)
+        self._sender.start()
+        atexit.register(self._close)
+        if self.system_metrics:
+            self._sampler = Sampler(self._record_machine, self._recorded.next_step("system/"))
+            self._sampler.start()
 
-        self._monitor = SystemMetricsMonitor(
-            self.run_id, sampling_interval=10, resume_logging=resumed, tracking_uri=self.uri
-        )
-        self._monitor.start()
+    def _begin_record(self) -> str:
+        """Return the store of the run; a new one is noted."""
+        if self.resume_from is not None or (self.folder / RUN_FILE).exists():
+            record = RunRecord.load(self.folder)
+            if record.tracking_uri:
+                return record.tracking_uri
+        else:
+            record = RunRecord(self.experiment_name, self.folder.name)
+        record.tracking_uri = tracking_uri(self.given_uri, self.root)
+        record.save(self.folder)
+        return record.tracking_uri
+
+    def _record_machine(self, numbers: dict[str, float], step: int) -> None:
+        self._append({"type": "metrics", "step": step, "values": numbers})
+
+    def _append_new(self, event: Event) -> None:
+        if not self._recorded.has(event):
+            self._append(event)
+
+    def _append(self, event: Event) -> None:
+        assert self._journal is not None
+        with self._lock:
+            self._journal.append(event)
+            self._recorded.add({"t": 0, **event})
+
+    def _close(self) -> None:
+        """Stop the threads and close the journal; the logger can be used again."""
+        atexit.unregister(self._close)
+        if self._journal is None or self._sender is None:
+            return
+        if self._sampler is not None:
+            self._sampler.stop()
+            self._sampler = None
+        self._sender.stop()
+        lost = self._journal.close()
+        self._journal = self._sender = None
+        if lost:
+            print(
+                f"The disk is full: {lost} events of {self.folder} could not be written. They are recorded "
+                "again when the run continues with --ckpt_path last.",
+                file=sys.stderr,
+            )
 
 
 def _first_rank() -> bool:
     return getattr(rank_zero_only, "rank", 0) == 0  # Lightning sets the attribute on its function
-
-
-def _log_params(params: Sequence[Any], client: MlflowClient, run: str) -> None:
-    client.log_batch(run, params=params)
-
-
-def _set_tag(key: str, value: str, client: MlflowClient, run: str) -> None:
-    client.set_tag(run, key, value)

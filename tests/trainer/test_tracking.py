@@ -1,226 +1,427 @@
+"""Runs arrive whole in their tracking store, whatever the store does meanwhile."""
+
 import json
-import os
-import socket
-import subprocess
-import sys
-import threading
 import time
-import urllib.request
-from http.server import BaseHTTPRequestHandler, HTTPServer
+import uuid
+from types import SimpleNamespace
 
 import pytest
+from lightning.pytorch.utilities import rank_zero_only
+from PIL import Image
 
-from trainer.commands import upload
-from trainer.runs import RunRecord
-from trainer.tracking import MLflowTracking, open_client, tracking_uri, unreachable
+from trainer.runs import RunRecord, new_folder
+from trainer.spool.delivery import Sent
+from trainer.spool.journal import events
+from trainer.spool.machine import Sampler
+from trainer.tracking import MLflowTracking, open_client, tracking_uri
 
-
-@pytest.fixture(autouse=True)
-def _here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-
-
-def free_port():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
+pytestmark = pytest.mark.usefixtures("workplace", "quick_sending")
 
 
-@pytest.fixture
-def server(tmp_path):
-    """A real tracking server on loopback; its URI, and functions that start and kill it."""
-    port = free_port()
-    uri = f"http://127.0.0.1:{port}"
-    folder = tmp_path / "server"
-    folder.mkdir()
-    command = [
-        sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{folder}/db",
-        "--artifacts-destination", str(folder / "artifacts"), "--host", "127.0.0.1", "--port", str(port),
-        "--workers", "1",
-    ]  # fmt: skip
-    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-
-    def start():
-        process = subprocess.Popen(
-            command,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        for _ in range(240):
-            try:
-                urllib.request.urlopen(f"{uri}/health", timeout=1).close()
-                return process
-            except OSError:
-                time.sleep(0.5)
-        raise AssertionError("the tracking server did not start")
-
-    def stop(process):
-        os.killpg(process.pid, 9)  # the server and its own workers: the group that was started above
-        process.wait()
-
-    return uri, start, stop
+def logger(uri=None, **options):
+    return MLflowTracking(f"exp-{uuid.uuid4().hex[:8]}", uri, **{"system_metrics": False} | options)
 
 
-def arguments(folder, to=None):
-    import argparse
-
-    return argparse.Namespace(run=folder, to=to)
-
-
-def test_local_store_needs_no_server_and_holds_everything(tmp_path):
-    logger = MLflowTracking("exp", system_metrics=False)
-    logger.log_metrics({"train/loss": 0.5}, step=3)
-    logger.log_params({"model.layers": 6})
-    logger.log_text("seed: 1\n", "config.yaml")
-    logger.finalize("success")
-    run = open_client(logger.uri).get_run(logger.run_id)
-    assert run.data.metrics == {"train/loss": 0.5}
-    assert run.data.params == {"model.layers": "6"}
-    assert run.info.status == "FINISHED"
-    assert (tmp_path / "runs" / "mlflow.db").is_file()
-    assert (tmp_path / "runs" / "artifacts" / "exp" / logger.run_id / "artifacts" / "config.yaml").is_file()
+def continued(first, **options):
+    options = {"system_metrics": False, "resume_from": str(first.folder)} | options
+    return MLflowTracking(first.experiment_name, **options)
 
 
-def test_resumed_logger_continues_the_same_run_and_keeps_its_parameters():
-    first = MLflowTracking("exp", system_metrics=False)
+def killed(log):
+    """End the threads of a run as SIGKILL does: nothing more is recorded or sent."""
+    log._sender.stop()
+    log._sender.join()
+    return log
+
+
+def history(log, key):
+    found = open_client(log.uri).get_metric_history(log.run_id, key)
+    return [(metric.step, metric.value) for metric in found]
+
+
+def files(log, folder=None):
+    return [file.path for file in open_client(log.uri).list_artifacts(log.run_id, folder)]
+
+
+def stored(log):
+    return open_client(log.uri).get_run(log.run_id)
+
+
+def rejected(log):
+    return (log.folder / "spool" / "rejected.jsonl").read_text().splitlines()
+
+
+def record_all(log):
+    log.log_metrics({"loss": 1.0}, step=0)
+    log.log_params({"lr": 0.1})
+    log.set_tags({"note": "x"})
+    log.log_text("seed: 1\n", "config.yaml")
+    log.log_picture(Image.new("RGB", (40, 30)), "validation/a-0", 0)
+    log.log_metrics({"loss": 0.5}, step=1)
+
+
+def assert_complete(log, status="FINISHED"):
+    run = stored(log)
+    assert history(log, "loss") == [(0, 1.0), (1, 0.5)]
+    assert run.data.params == {"lr": "0.1"}
+    assert (run.data.tags["note"], run.info.status) == ("x", status)
+    assert files(log) == ["config.yaml", "images"]
+    assert [name.rsplit(".", 1)[1] for name in files(log, "images")] == ["webp", "png"]
+    runs = open_client(log.uri).search_runs([run.info.experiment_id])
+    assert [found.info.run_id for found in runs] == [log.run_id]
+
+
+def test_local_store_needs_no_server_and_holds_everything_at_the_end(workplace):
+    log = logger()
+    record_all(log)
+    log.finalize("success")
+    assert_complete(log)
+    artifacts = workplace / "runs" / "artifacts" / log.experiment_name / log.run_id / "artifacts"
+    assert (artifacts / "config.yaml").is_file()
+
+
+def test_run_folder_and_record_are_there_before_any_server_answers(proxy):
+    log = logger(proxy.uri)
+    log.log_metrics({"loss": 1.0}, step=0)
+    assert RunRecord.load(log.folder).tracking_uri == proxy.uri
+    assert log.run_id == ""
+    killed(log)
+
+
+def test_resumed_logger_continues_the_same_run_and_says_what_changed():
+    first = logger()
     first.log_params({"lr": 0.001})
     first.log_metrics({"loss": 2.0}, step=1)
-    again = MLflowTracking("exp", system_metrics=False, resume_from=str(first.folder))
-    again.log_params({"lr": 0.1, "new": 1})
+    first.finalize("failed")
+    again = continued(first)
+    assert again.log_params({"lr": 0.1, "new": 1}) == {"lr": ("0.001", "0.1")}
     again.log_metrics({"loss": 1.0}, step=2)
     again.finalize("success")
-    run = open_client(first.uri).get_run(first.run_id)
     assert again.run_id == first.run_id
-    assert run.data.params == {"lr": "0.001", "new": "1"}
-    assert [m.step for m in open_client(first.uri).get_metric_history(first.run_id, "loss")] == [1, 2]
+    assert stored(again).data.params == {"lr": "0.001", "new": "1"}
+    assert stored(again).info.status == "FINISHED"
+    assert history(again, "loss") == [(1, 2.0), (2, 1.0)]
+
+
+def test_steps_that_are_trained_again_after_a_kill_are_recorded_once():
+    first = logger()
+    for step in range(5):
+        first.log_metrics({"loss": float(step), "epoch": 0}, step=step)
+    killed(first)
+    again = continued(first)
+    for step in range(3, 8):
+        again.log_metrics({"loss": float(step), "epoch": 0}, step=step)
+    again.finalize("success")
+    for key in ("loss", "epoch"):
+        assert [step for step, _ in history(again, key)] == list(range(8))
+
+
+def test_number_is_recorded_once_when_it_is_logged_twice_at_a_step():
+    log = logger()
+    log.log_metrics({"epoch": 0, "loss": 1.0}, step=3)
+    log.log_metrics({"epoch": 0, "val": 2.0}, step=3)
+    log.finalize("success")
+    assert history(log, "epoch") == [(3, 0.0)]
 
 
 @pytest.mark.parametrize("end", ["success", "failed"])
 @pytest.mark.parametrize("status", ["FINISHED", "FAILED"])
 def test_evaluation_adds_scores_and_keeps_the_status_of_the_training(status, end):
-    training = MLflowTracking("exp", system_metrics=False)
+    training = logger()
     training.log_metrics({"loss": 2.0}, step=1)
     training.finalize("success" if status == "FINISHED" else "failed")
-    before = open_client(training.uri).get_run(training.run_id).info
-    test = MLflowTracking("exp", system_metrics=False, resume_from=str(training.folder), evaluation=True)
+    before = stored(training).info
+    test = continued(training, evaluation=True)
     test.log_metrics({"test/psnr": 30.0}, step=1)
     test.finalize(end)
-    run = open_client(training.uri).get_run(training.run_id)
+    run = stored(test)
     assert run.data.metrics["test/psnr"] == 30.0
     assert (run.info.status, run.info.end_time) == (status, before.end_time)
 
 
-def test_evaluation_whose_run_is_gone_ends_the_new_run_with_its_own_status(capsys):
-    training = MLflowTracking("exp", system_metrics=False)
-    record = training.record
-    record.run_id = "0" * 32
-    record.save(training.folder)
-    test = MLflowTracking("exp", system_metrics=False, resume_from=str(training.folder), evaluation=True)
+def test_repeated_evaluation_records_only_what_differs():
+    training = logger()
+    training.log_metrics({"loss": 2.0}, step=1)
+    training.finalize("success")
+    for score in (30.0, 30.0, 31.0):
+        test = continued(training, evaluation=True)
+        test.log_metrics({"test/psnr": score}, step=1)
+        test.finalize("success")
+    assert sorted(value for _, value in history(training, "test/psnr")) == [30.0, 31.0]
+
+
+def test_evaluation_of_an_old_run_that_is_gone_ends_the_new_one_with_its_own_status(workplace, capsys):
+    folder = new_folder(workplace / "runs", "old")
+    RunRecord("old", folder.name, tracking_uri(None), "0" * 32).save(folder)
+    test = MLflowTracking("old", system_metrics=False, resume_from=str(folder), evaluation=True)
     test.log_metrics({"test/psnr": 30.0}, step=1)
     test.finalize("failed")
-    assert "is no longer in its store" in capsys.readouterr().err
-    assert open_client(test.uri).get_run(test.run_id).info.status == "FAILED"
+    assert "is no longer in" in capsys.readouterr().err
+    assert stored(test).info.status == "FAILED"
 
 
-def test_unreachable_server_falls_back_to_the_local_store_and_says_so_once(capsys):
-    uri = f"http://127.0.0.1:{free_port()}"
-    logger = MLflowTracking("exp", tracking_uri=uri, system_metrics=False)
-    for step in range(3):
-        logger.log_metrics({"loss": 1.0 / (step + 1)}, step=step)
-    logger.finalize("success")
-    message = capsys.readouterr().err
-    assert message.count(uri) == 1
-    assert f"trainer upload {logger.folder}" in message
-    assert json.loads((logger.folder / "run.json").read_text())["unreached_uri"] == uri
-    assert len(open_client(logger.uri).get_metric_history(logger.run_id, "loss")) == 3
+def test_old_run_without_a_journal_is_continued_and_keeps_its_first_parameters(workplace, capsys):
+    uri = tracking_uri(None)
+    client = open_client(uri)
+    run = client.create_run(client.create_experiment("old"), run_name="r").info.run_id
+    client.log_param(run, "lr", "0.1")
+    folder = new_folder(workplace / "runs", "old")
+    RunRecord("old", folder.name, uri, run, "http://127.0.0.1:9", None).save(folder)
+    log = MLflowTracking("old", system_metrics=False, resume_from=str(folder))
+    log.log_params({"lr": 0.2, "width": 3})
+    log.finalize("success")
+    found = client.get_run(run)
+    assert found.data.params == {"lr": "0.1", "width": "3"}
+    assert found.info.status == "FINISHED"
+    assert "lr: 0.1 → 0.2" in capsys.readouterr().err
+    assert "lr: 0.1 → 0.2" in found.data.tags["params.changed"]
 
 
-def test_upload_to_an_unreachable_server_fails_and_changes_nothing():
-    logger = MLflowTracking("exp", system_metrics=False)
-    logger.log_metrics({"loss": 1.0}, step=0)
-    before = (logger.folder / "run.json").read_text()
-    with pytest.raises(ValueError, match=r"cannot be reached .* nothing was sent"):
-        upload.run(arguments(logger.folder, to=f"http://127.0.0.1:{free_port()}"))
-    assert (logger.folder / "run.json").read_text() == before
+def test_numbers_that_are_not_finite_arrive():
+    log = logger()
+    log.log_metrics({"nan": float("nan"), "up": float("inf"), "down": float("-inf")}, step=0)
+    log.finalize("success")
+    metrics = stored(log).data.metrics
+    assert metrics["nan"] != metrics["nan"]
+    assert metrics["up"] > 1e308
+    assert metrics["down"] < -1e308
 
 
-@pytest.fixture
-def proxy():
-    """A server on loopback that answers every request with one status; its URI, and the status to set."""
-    answers = {"status": 200}
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self):
-            self.send_response(answers["status"])
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, format, *args):
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as http:
-        thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.05})
-        thread.start()
-        yield f"http://127.0.0.1:{http.server_port}", answers
-        http.shutdown()
-        thread.join()
+def test_very_long_values_are_cut_and_arrive(proxy):
+    proxy.start()
+    log = logger(proxy.uri)
+    log.log_params({"long": "é" * 20_000})
+    log.set_tags({"long": "é" * 20_000})
+    log.finalize("success")
+    data = stored(log).data
+    assert len(data.params["long"]) == 6000
+    assert len(data.tags["long"]) == 8000
+    assert data.tags["long"].endswith("…")
 
 
-def test_server_behind_a_proxy_that_guards_or_hides_the_health_path_counts_as_reachable(proxy):
-    uri, answers = proxy
-    for status in (200, 401, 403, 404):
-        answers["status"] = status
-        assert unreachable(uri) is None, status
-    for status in (500, 502, 503):
-        answers["status"] = status
-        assert unreachable(uri) == f"HTTP status {status}"
+def test_entry_that_the_server_refuses_is_put_aside_and_the_rest_arrives(proxy, capsys):
+    proxy.start()
+    log = logger(proxy.uri)
+    log.log_metrics({"bad//name": 1.0} | {f"m{n}": float(n) for n in range(9)}, step=0)
+    log.set_tags({"after": "yes"})
+    log.finalize("success")
+    run = stored(log)
+    assert len(run.data.metrics) == 9
+    assert (run.data.tags["after"], run.info.status) == ("yes", "FINISHED")
+    refused = [json.loads(line) for line in rejected(log)]
+    assert [entry["event"]["values"] for entry in refused] == [{"bad//name": 1.0}]
+    assert "bad//name" in capsys.readouterr().err
 
 
-def test_upload_without_a_server_asks_for_one():
-    logger = MLflowTracking("exp", system_metrics=False)
-    logger.log_metrics({"loss": 1.0}, step=0)
-    with pytest.raises(ValueError, match="--to URI"):
-        upload.run(arguments(logger.folder))
+def test_server_that_is_away_at_the_start_gets_everything_when_it_comes(proxy, capsys):
+    log = logger(proxy.uri)
+    record_all(log)
+    assert log.flush(5.0) > 0
+    proxy.start()
+    log.finalize("success")
+    assert_complete(log)
+    said = capsys.readouterr().err
+    assert said.count("cannot be used (connection refused)") == 1
+    assert said.count("answers again after") == 1
+    assert f"trainer sync {log.folder}" in said
+
+
+def test_server_that_is_away_for_the_whole_run_leaves_all_in_the_journal_for_the_continued_run(proxy, capsys):
+    log = logger(proxy.uri)
+    record_all(log)
+    log.finalize("success")
+    said = capsys.readouterr().err
+    assert f"`trainer sync {log.folder}` sends them" in said
+    proxy.start()
+    again = continued(log)
+    again.log_params({"lr": 0.1})
+    again.finalize("success")
+    assert_complete(again)
+
+
+@pytest.mark.parametrize("status", [500, 502, 503, 404, 400])
+def test_answers_that_are_not_mlflows_lose_nothing(proxy, status, capsys):
+    proxy.start()
+    log = logger(proxy.uri)
+    log.log_metrics({"loss": 1.0}, step=0)
+    assert log.flush(5.0) == 0
+    proxy.status = status
+    record_all(log)
+    assert log.flush(5.0) > 0
+    proxy.status = None
+    log.finalize("success")
+    assert_complete(log)
+    assert f"HTTP status {status}" in capsys.readouterr().err
+    assert not (log.folder / "spool" / "rejected.jsonl").exists()
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_refused_credentials_are_named_and_nothing_is_lost(proxy, status, capsys):
+    proxy.status = status
+    proxy.start()
+    log = logger(proxy.uri)
+    record_all(log)
+    assert log.flush(5.0) > 0
+    proxy.status = None
+    log.finalize("success")
+    assert_complete(log)
+    said = capsys.readouterr().err
+    assert said.count("MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN") == 1
+
+
+def test_files_that_the_server_cannot_keep_at_present_are_sent_later(proxy):
+    proxy.start()
+    proxy.status, proxy.refuse = 500, "mlflow-artifacts"
+    log = logger(proxy.uri)
+    record_all(log)
+    assert log.flush(5.0) > 0
+    proxy.status = None
+    log.finalize("success")
+    assert_complete(log)
+
+
+def test_slow_server_is_asked_rarely_and_gets_everything(proxy):
+    proxy.start()
+    proxy.delay_s = 0.2
+    log = logger(proxy.uri)
+    for step in range(300):
+        log.log_metrics({"loss": 1.0, "rate": 2.0}, step=step)
+    log.finalize("success")
+    assert [step for step, _ in history(log, "loss")] == list(range(300))
+    assert sum("log-batch" in request for request in proxy.log) <= 20
+
+
+def test_server_that_restarts_again_and_again_gets_every_number_once(proxy):
+    log = logger(proxy.uri)
+    for step in range(60):
+        if step % 10 == 0:
+            (proxy.start if step % 20 == 0 else proxy.stop)()
+            log.flush(0.5)
+        log.log_metrics({"loss": float(step)}, step=step)
+    proxy.start()
+    log.finalize("success")
+    assert [step for step, _ in history(log, "loss")] == list(range(60))
+
+
+@pytest.mark.parametrize("store", ["server", "local"])
+def test_run_that_is_deleted_in_the_middle_is_replaced_by_one_with_everything(proxy, store, capsys):
+    proxy.start()
+    log = logger(proxy.uri if store == "server" else None)
+    record_all(log)
+    assert log.flush(30.0) == 0
+    deleted = log.run_id
+    open_client(log.uri).delete_run(deleted)
+    log.finalize("success")
+    assert log.run_id != deleted
+    assert_complete(log)
+    assert capsys.readouterr().err.count("is no longer in") == 1
+
+
+def test_run_that_is_deleted_before_it_is_continued_is_replaced_by_one_with_everything():
+    first = logger()
+    record_all(first)
+    first.finalize("failed")
+    open_client(first.uri).delete_run(first.run_id)
+    again = continued(first)
+    again.log_params({"lr": 0.1})
+    again.finalize("success")
+    assert_complete(again)
+
+
+def test_run_that_was_made_but_not_noted_before_a_kill_is_found_again():
+    first = logger()
+    record_all(first)
+    assert first.flush(30.0) == 0
+    made = first.run_id
+    killed(first)
+    record = first.record
+    record.run_id = None
+    record.save(first.folder)
+    (first.folder / "spool" / "sent.json").unlink()
+    again = continued(first)
+    again.log_params({"lr": 0.1})
+    again.finalize("success")
+    assert again.run_id == made
+    assert_complete(again)
+
+
+def test_everything_can_be_sent_twice(proxy):
+    proxy.start()
+    log = logger(proxy.uri)
+    record_all(log)
+    log.log_metrics({"nan": float("nan"), "inf": float("inf")}, step=1)
+    assert log.flush(30.0) == 0
+    killed(log)
+    Sent(log.run_id).save(log.folder)
+    again = continued(log)
+    again.log_params({"lr": 0.1})
+    again.finalize("success")
+    assert_complete(again)
+    assert len(history(again, "nan")) == len(history(again, "inf")) == 1
+
+
+def test_clock_that_is_set_back_or_forth_never_turns_the_order(monkeypatch):
+    log = logger()
+    log.log_metrics({"loss": 1.0}, step=0)
+    monkeypatch.setattr(time, "time", lambda: 1e9)
+    log.log_metrics({"loss": 0.9}, step=1)
+    killed(log)
+    again = continued(log)
+    again.log_metrics({"loss": 0.8}, step=2)
+    again.finalize("success")
+    times = [event["t"] for event, _ in events(log.folder)]
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 1e6
+    found = open_client(again.uri).get_metric_history(again.run_id, "loss")
+    assert [m.step for m in sorted(found, key=lambda m: m.timestamp)] == [0, 1, 2]
+
+
+def test_machine_is_sampled_into_the_journal_and_its_steps_go_on_after_a_kill(monkeypatch):
+    from trainer.spool import machine
+
+    monkeypatch.setattr(machine, "INTERVAL_S", 0.05)
+    key = "system/system_memory_usage_percentage"
+    log = logger(system_metrics=True)
+    log.log_metrics({"loss": 1.0}, step=0)
+    wait_for_samples(log, key, 2)
+    log._sampler.stop()
+    killed(log)
+    again = continued(log, system_metrics=True)
+    again.log_metrics({"loss": 1.0}, step=1)
+    wait_for_samples(log, key, 4)
+    again.finalize("success")
+    steps = [step for step, _ in history(again, key)]
+    assert steps == list(range(len(steps)))
+
+
+def wait_for_samples(log, key, count):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        samples = [event for event, _ in events(log.folder) if key in event.get("values", {})]
+        if len(samples) >= count:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the machine is not sampled")
+
+
+def test_sampler_stops_at_once():
+    sampler = Sampler(lambda numbers, step: None, 0)
+    sampler.start()
+    sampler.stop()
+    assert not sampler.is_alive()
+
+
+def test_other_ranks_record_nothing(workplace, monkeypatch):
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    log = logger()
+    record_all(log)
+    log.log_file(workplace / "absent")
+    log.after_save_checkpoint(SimpleNamespace())
+    log.finalize("success")
+    assert [path.name for path in (workplace / "runs").iterdir()] == ["mlflow.db"]
 
 
 def test_uri_of_the_environment_is_used_unless_one_is_given(monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://example.invalid:1")
     assert tracking_uri(None) == "http://example.invalid:1"
     assert tracking_uri("sqlite:///x") == "sqlite:///x"
-
-
-def test_server_lost_in_mid_run_loses_nothing_and_upload_completes_its_run(server, monkeypatch):
-    uri, start, stop = server
-    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
-    process = start()
-    try:
-        logger = MLflowTracking("exp", tracking_uri=uri, system_metrics=False)
-        logger.log_metrics({"loss": 3.0}, step=0)
-        logger.log_params({"lr": 0.001})
-        remote_id = logger.run_id
-    finally:
-        stop(process)
-    logger.log_metrics({"loss": 2.0}, step=1)
-    logger.log_text("text", "note.txt")
-    logger.log_params({"lr": 0.001, "width": 14})
-    logger.finalize("success")
-    assert logger.uri.startswith("sqlite:///")
-    process = start()
-    try:
-        assert upload.run(arguments(logger.folder)) == 0
-        client = open_client(uri)
-        run = client.get_run(remote_id)
-        assert [(m.step, m.value) for m in client.get_metric_history(remote_id, "loss")] == [
-            (0, 3.0),
-            (1, 2.0),
-        ]
-        assert run.data.params == {"lr": "0.001", "width": "14"}
-        assert run.info.status == "FINISHED"
-        assert [f.path for f in client.list_artifacts(remote_id)] == ["note.txt"]
-        record = RunRecord.load(logger.folder)
-        assert (record.tracking_uri, record.run_id) == (uri, remote_id)
-    finally:
-        stop(process)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -15,7 +13,8 @@ from trainer.tracking import MLflowTracking
 class ExportBest(Callback):
     """At the end of `fit`: best checkpoint → ONNX and TorchScript, with parity, into the run.
 
-    An export that fails says why and leaves the run as it is; `trainer export` repeats it.
+    The model is registered as soon as the tracking store takes it. An export that fails says why and leaves
+    the run as it is; `trainer export` repeats it.
 
     Args:
         formats: What to write; any of `onnx`, `torchscript`.
@@ -43,11 +42,9 @@ class ExportBest(Callback):
 
     def _try(self, logger: MLflowTracking, checkpoint: Path, format: str) -> None:
         """Export in one format; one that fails does not keep the others from being written."""
-        from mlflow.exceptions import MlflowException
-
         try:
             self._export(logger, checkpoint, format)
-        except (ValueError, OSError, MlflowException) as error:
+        except (ValueError, OSError) as error:
             logger.set_tags({"export.error": str(error)[:500]})
             print(
                 f"The export failed: {error}\nThe checkpoint is {checkpoint}; repeat with "
@@ -66,12 +63,6 @@ class ExportBest(Callback):
         logger.log_file(path, "export")
         logger.set_tags({f"export.{format}.parity": f"{parity.error:.3e}"})
         if format == "onnx" and self.register and logger.registered_model:
-            name = logger.registered_model
-            version = logger.call(partial(_register, logger, path, name))
-            print(f"registered models:/{name}/{version}", file=sys.stderr)
+            from trainer.export.register import weights_of
 
-
-def _register(logger: MLflowTracking, path: Path, name: str, client: Any, run_id: str) -> str:
-    from trainer.export.register import log_and_register
-
-    return log_and_register(run_id, path, name, logger.uri)
+            logger.log_model(path, logger.registered_model, weights_of(loaded.model))  # type: ignore[arg-type]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import platform
 import subprocess
+import sys
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import yaml
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.cli import SaveConfigCallback
 
@@ -26,11 +28,9 @@ class RunRecorder(SaveConfigCallback):
         logger = trainer.logger
         if stage != "fit" or not isinstance(logger, MLflowTracking):
             return
-        text = self.parser.dump(self.config, skip_none=False)
-        name = config_name(logger.folder)
-        (logger.folder / name).write_text(text)
-        logger.log_text(text, name)
-        logger.log_params(flatten(self.config.as_dict()))
+        config = flatten(self.config.as_dict())
+        changes = logger.log_params(config)
+        self._keep(logger, self.parser.dump(self.config, skip_none=False), changes)
         logger.log_text("\n".join(installed()) + "\n", "packages.txt")
         manifest_hash = getattr(trainer.datamodule, "manifest_hash", None)  # type: ignore[attr-defined]
         tags = {f"version.{name}": version for name, version in versions().items()}
@@ -38,6 +38,34 @@ class RunRecorder(SaveConfigCallback):
         tags |= {"data.manifest_hash": str(manifest_hash), "python": platform.python_version()}
         tags["parameters"] = str(sum(p.numel() for p in pl_module.parameters() if p.requires_grad))
         logger.set_tags(tags)
+
+    def _keep(self, logger: MLflowTracking, text: str, changes: dict[str, tuple[str, str]]) -> None:
+        """Keep the configuration, and say what is not as it was when the run began.
+
+        MLflow refuses changed parameters: the run's page keeps the first values, and a tag tells the others.
+        """
+        name = config_name(logger.folder)
+        if name != "config.yaml" and same_configuration(logger.folder, text):
+            return
+        (logger.folder / name).write_text(text)
+        logger.log_text(text, name)
+        if changes:
+            lines = [f"{key}: {first} → {now}" for key, (first, now) in changes.items()]
+            logger.set_tags({f"changed.{Path(name).stem}": "\n".join(lines)})
+            print(
+                f"The run continues with other values than it began with ({logger.folder / name}):",
+                *lines, sep="\n  ", file=sys.stderr,
+            )  # fmt: skip
+
+
+def same_configuration(folder: Path, text: str) -> bool:
+    """Return whether the newest configuration of a run folder says what a text says."""
+    newest = max(folder.glob("config*.yaml"), key=lambda path: (len(path.name), path.name))
+    try:
+        before, now = yaml.safe_load(newest.read_text()), yaml.safe_load(text)
+    except yaml.YAMLError:
+        return False
+    return isinstance(before, dict) and isinstance(now, dict) and flatten(before) == flatten(now)
 
 
 def config_name(folder: Path) -> str:
@@ -57,7 +85,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a nested configuration as `a.b.c` → value, without empty branches and command options."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        if key in ("config", "ckpt_path"):
+        if key in ("config", "ckpt_path", "resume_from", "evaluation"):
             continue
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):

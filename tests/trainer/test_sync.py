@@ -1,0 +1,266 @@
+"""`trainer sync`, `trainer upload`, and the models that arrive with a run."""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+
+from models import WSKP
+from tests.tracking_server import free_port
+from tests.trainer.test_tracking import assert_complete, continued, history, killed, logger, record_all, stored
+from trainer.commands import sync, upload
+from trainer.configs import UsageError
+from trainer.export import export
+from trainer.export.register import weights_of
+from trainer.runs import RunRecord
+from trainer.spool.delivery import Sent, left
+from trainer.spool.sender import Lock
+from trainer.spool.store import unreachable
+from trainer.tracking import MLflowTracking, open_client
+
+pytestmark = pytest.mark.usefixtures("workplace", "quick_sending")
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch):
+    monkeypatch.setattr(sync.time, "sleep", lambda seconds: None)
+
+
+def synced(*folders, every=False):
+    parser = argparse.ArgumentParser()
+    sync.add_arguments(parser)
+    return sync.run(parser.parse_args([*map(str, folders), *(["--all"] if every else [])]))
+
+
+def uploaded(folder, to=None):
+    return upload.run(argparse.Namespace(run=folder, to=to))
+
+
+def unsent(uri):
+    log = logger(uri)
+    record_all(log)
+    log.finalize("success")
+    assert left(log.folder) > 0
+    return log
+
+
+def test_sync_sends_what_is_left_once_and_says_so(proxy, capsys):
+    log = unsent(proxy.uri)
+    assert synced(log.folder) == 1
+    assert "events are left. The tracking server" in capsys.readouterr().out
+    proxy.start()
+    assert synced(log.folder) == 0
+    said = capsys.readouterr().out
+    assert "sent 2 metric values and 2 files to" in said
+    assert_complete(log)
+    assert synced(log.folder) == 0
+    assert "nothing is left" in capsys.readouterr().out
+
+
+def test_sync_of_all_finds_the_runs_that_have_something_left(proxy, capsys):
+    runs = [unsent(proxy.uri), unsent(proxy.uri)]
+    whole = logger()
+    whole.log_metrics({"loss": 1.0}, step=0)
+    whole.finalize("success")
+    proxy.start()
+    assert synced(every=True) == 0
+    said = capsys.readouterr().out
+    assert all(str(log.folder) in said for log in runs)
+    assert str(whole.folder) not in said
+    for log in runs:
+        assert_complete(log)
+    assert synced(every=True) == 0
+    assert "nothing is left to send below runs" in capsys.readouterr().out
+
+
+def test_sync_of_nothing_asks_for_runs_and_of_another_folder_says_that_it_is_none(workplace):
+    with pytest.raises(UsageError, match="--all"):
+        synced()
+    with pytest.raises(ValueError, match=r"is not a run folder"):
+        synced(workplace)
+
+
+def test_sync_names_refused_credentials(proxy, capsys):
+    log = unsent(proxy.uri)
+    proxy.status = 401
+    proxy.start()
+    assert synced(log.folder) == 1
+    assert "MLFLOW_TRACKING_USERNAME" in capsys.readouterr().out
+
+
+def test_sync_leaves_a_run_alone_that_another_process_sends(proxy, capsys):
+    log = unsent(proxy.uri)
+    lock = Lock(log.folder)
+    assert lock.acquire()
+    proxy.start()
+    assert synced(log.folder) == 1
+    assert "another process" in capsys.readouterr().out
+    assert proxy.log == []
+    lock.release()
+    assert synced(log.folder) == 0
+
+
+def test_run_that_is_sent_elsewhere_is_trained_on_and_waits_for_its_turn(proxy):
+    log = unsent(proxy.uri)
+    lock = Lock(log.folder)
+    assert lock.acquire()
+    again = continued(log)
+    again.log_metrics({"loss": 0.2}, step=2)
+    proxy.start()
+    assert again.flush(0.5) > 0
+    lock.release()
+    again.finalize("success")
+    assert [step for step, _ in history(again, "loss")] == [0, 1, 2]
+
+
+def test_upload_moves_a_local_run_to_the_server_with_everything(proxy, capsys):
+    log = logger()
+    record_all(log)
+    log.finalize("success")
+    proxy.start()
+    assert uploaded(log.folder, proxy.uri) == 0
+    assert RunRecord.load(log.folder).tracking_uri == proxy.uri
+    assert_complete(log)
+    capsys.readouterr()
+    assert uploaded(log.folder, proxy.uri) == 0
+    assert "is tracked by" in capsys.readouterr().out
+
+
+def test_upload_of_a_run_from_before_the_journal_sends_what_its_store_holds(proxy):
+    log = logger()
+    record_all(log)
+    log.finalize("success")
+    record = log.record
+    shutil.rmtree(log.folder / "spool")
+    # as it was left by a version that went on with the local store when a server broke away
+    server = open_client(proxy.start().uri)
+    begun = server.create_run(server.create_experiment(record.experiment), run_name=record.name).info.run_id
+    record.unreached_uri, record.server_run_id = proxy.uri, begun
+    record.save(log.folder)
+    assert uploaded(log.folder) == 0
+    assert log.run_id == begun
+    assert_complete(log)
+
+
+def test_upload_to_an_unreachable_server_fails_and_changes_nothing():
+    log = logger()
+    log.log_metrics({"loss": 1.0}, step=0)
+    log.finalize("success")
+    before = (log.folder / "run.json").read_text()
+    with pytest.raises(ValueError, match=r"cannot be reached .* nothing was sent"):
+        uploaded(log.folder, f"http://127.0.0.1:{free_port()}")
+    assert (log.folder / "run.json").read_text() == before
+
+
+def test_upload_without_a_server_asks_for_one():
+    log = logger()
+    log.log_metrics({"loss": 1.0}, step=0)
+    log.finalize("success")
+    with pytest.raises(ValueError, match="--to URI"):
+        uploaded(log.folder)
+
+
+def test_upload_of_a_run_that_is_being_trained_is_refused(proxy):
+    log = logger()
+    log.log_metrics({"loss": 1.0}, step=0)
+    log.flush()
+    with pytest.raises(ValueError, match="is being trained"):
+        uploaded(log.folder, proxy.start().uri)
+    killed(log)
+
+
+def test_server_behind_a_proxy_that_guards_or_hides_the_health_path_counts_as_reachable(proxy):
+    proxy.start()
+    for status in (200, 401, 403, 404):
+        proxy.status = status
+        assert unreachable(proxy.uri) is None, status
+    for status in (500, 502, 503):
+        proxy.status = status
+        assert unreachable(proxy.uri) == f"HTTP status {status}"
+
+
+def test_model_is_registered_once_for_the_same_weights_whatever_breaks_away(workplace, proxy, capsys):
+    net = WSKP(layers=3).eval()
+    path = workplace / "wskp.onnx"
+    export(net, path, "onnx")
+    proxy.start()
+    proxy.status, proxy.refuse = 503, "model-versions/create"
+    log = logger(proxy.uri)
+    name = f"model-{log.experiment_name}"
+    log.log_model(path, name, weights_of(net))
+    log.log_model(path, name, weights_of(net))
+    assert log.flush(10.0) == 1
+    proxy.status = None
+    log.finalize("success")
+    Sent(log.run_id).save(log.folder)
+    assert synced(log.folder) == 0
+    client = open_client(log.uri)
+    versions = client.search_model_versions(f"name = '{name}'")
+    assert [(v.version, v.run_id, v.status) for v in versions] == [("1", log.run_id, "READY")]
+    models = client.search_logged_models([stored(log).info.experiment_id])
+    assert [model.model_id for model in models] == [versions[0].model_id]
+    assert capsys.readouterr().err.count(f"registered models:/{name}/1") == 1
+
+
+@pytest.fixture
+def server(tmp_path):
+    """A real `mlflow server` on loopback: its URI, and functions that start and kill it."""
+    port = free_port()
+    uri, folder = f"http://127.0.0.1:{port}", tmp_path / "server"
+    folder.mkdir()
+    command = [
+        sys.executable, "-m", "mlflow", "server", "--backend-store-uri", f"sqlite:///{folder}/db",
+        "--artifacts-destination", str(folder / "artifacts"), "--host", "127.0.0.1", "--port", str(port),
+        "--workers", "1",
+    ]  # fmt: skip
+    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+    running = []
+
+    def start():
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        running.append(subprocess.Popen(command, env=environment, start_new_session=True, **quiet))
+        deadline = time.monotonic() + 240
+        while time.monotonic() < deadline:
+            try:
+                urllib.request.urlopen(f"{uri}/health", timeout=1).close()
+                return
+            except OSError:
+                running[-1].poll()
+        raise AssertionError("the tracking server did not start")
+
+    def stop():
+        process = running.pop()
+        os.killpg(process.pid, 9)  # the server and its own workers: the group that was started above
+        process.wait()
+
+    yield uri, start, stop
+    while running:
+        stop()
+
+
+@pytest.mark.slow
+def test_mlflow_server_that_is_killed_in_mid_run_ends_with_everything_in_one_run(server):
+    uri, start, stop = server
+    start()
+    log = MLflowTracking("exp", tracking_uri=uri, system_metrics=False)
+    log.log_metrics({"loss": 3.0}, step=0)
+    log.log_params({"lr": 0.001})
+    assert log.flush(60.0) == 0
+    run = log.run_id
+    stop()
+    log.log_metrics({"loss": 2.0}, step=1)
+    log.log_text("text", "note.txt")
+    log.log_params({"lr": 0.001, "width": 14})
+    log.finalize("success")
+    start()
+    assert synced(log.folder) == 0
+    assert log.run_id == run
+    assert history(log, "loss") == [(0, 3.0), (1, 2.0)]
+    assert stored(log).data.params == {"lr": "0.001", "width": "14"}
+    assert stored(log).info.status == "FINISHED"
+    assert [file.path for file in open_client(uri).list_artifacts(run)] == ["note.txt"]
