@@ -47,6 +47,7 @@ def quiet_libraries() -> None:
         (r".*does not have many workers.*", UserWarning),  # the loader's own choice
         (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
         (r".*is smaller than the logging interval.*", UserWarning),
+        (r"Grad strides do not match bucket view strides", UserWarning),  # of 1x1 kernels, where both are one
         (
             r"It is recommended to use .*sync_dist=True",
             UserWarning,
