@@ -19,6 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from models.denoiser import Denoiser
 from trainer import configs, runs
 from trainer.callbacks.recorder import RunRecorder
+from trainer.elastic import join_ranks
 from trainer.tracking import MLflowTracking
 
 TRACKING = "trainer.tracking.MLflowTracking"
@@ -246,6 +247,7 @@ class TrainingCLI(LightningCLI):
         except ValueError as error:
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
+        join_ranks(self.trainer)
 
     def _parse_ckpt_path(self) -> None:
         """Compare the checkpoint's network, and a critic that goes on training, with the configured ones.
