@@ -49,6 +49,13 @@ DEVICE_FAILURE = re.compile(
     r"version is insufficient|out of memory|no kernel image is available|devices are busy or unavailable",
     re.IGNORECASE,
 )
+# What the others of a training see when one process of it ends.
+LOST_PROCESS = re.compile(
+    r"Connection (closed|reset) by peer|Broken pipe|NCCL.*(remote process exited|timeout)|"
+    r"Timed out waiting|Socket Timeout|wait timeout|connection was (closed|refused)",
+    re.IGNORECASE | re.DOTALL,
+)
+LOST_READER = re.compile(r"DataLoader worker \(pid\(?s?\)? [\d, ]+\)[^.\n]*")
 DATABASE_DETAIL = ("[SQL:", "[parameters:", "(Background on", "(raised as a result of")
 
 
@@ -115,6 +122,21 @@ def foreseen(error: Exception) -> str | None:
         return f"{FORESEEN[name]} (MLFLOW_TRACKING_URI, or runs/mlflow.db) cannot be used: {text}"
     if isinstance(error, (RuntimeError, AssertionError)) and DEVICE_FAILURE.search(text):
         return text
+    return _lost(str(error)) if isinstance(error, RuntimeError) else None
+
+
+def _lost(text: str) -> str | None:
+    """Return what to print where another process of the training ended, None for any other failure."""
+    if reader := LOST_READER.search(text):
+        return (
+            f"{reader.group()}; if nobody ended it, the machine ran out of memory: use fewer "
+            "--data.init_args.workers. Continue with --ckpt_path last"
+        )
+    if lost := LOST_PROCESS.search(text):
+        return (
+            f"another process of this training ended ({lost.group().splitlines()[0]}); its own message says "
+            "why. Continue with --ckpt_path last"
+        )
     return None
 
 

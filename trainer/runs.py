@@ -4,8 +4,8 @@
     runs/artifacts/                      its artifacts
     runs/<experiment>/<run name>/        one run: run.json, config.yaml, checkpoints/, export/, pictures/
 
-A launch is what restarts a training that was killed: `torchrun --max-restarts`, a Ray job, a Slurm job that is
-requeued. The run that it trains says so in `launch.json`, so that a restart finds it again.
+A launch is what restarts a training that was killed: `torchrun --max-restarts`, a Ray job, a Slurm job that
+is requeued. The run that it trains says so in `launch.json`, so that a restart finds it again.
 
 This module imports nothing heavy.
 """
@@ -136,8 +136,8 @@ class Launch:
     Attributes:
         identity: The same in every process and after every restart.
         restarts: Whether this is a restart, as far as that can be told.
-        unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is a
-            restart: who names a launch means that.
+        unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is
+            a restart: who names a launch means that.
     """
 
     identity: str
@@ -148,8 +148,8 @@ class Launch:
 def current_launch(environment: Mapping[str, str] = os.environ) -> Launch | None:
     """Return the launch that this process belongs to, None if nothing would restart it.
 
-    `PENUMBRA_LAUNCH` names one; otherwise torchrun's `--rdzv-id`, or on one machine its process; otherwise the
-    job of Slurm.
+    `PENUMBRA_LAUNCH` names one; otherwise torchrun's `--rdzv-id`, or on one machine its process; otherwise
+    the job of Slurm.
     """
     named = environment.get(LAUNCH_VARIABLE)
     if named:

@@ -19,6 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from models.denoiser import Denoiser
 from trainer import configs, runs
 from trainer.callbacks.recorder import RunRecorder
+from trainer.elastic import join_ranks
 from trainer.tracking import MLflowTracking
 
 TRACKING = "trainer.tracking.MLflowTracking"
@@ -47,6 +48,7 @@ def quiet_libraries() -> None:
         (r".*does not have many workers.*", UserWarning),  # the loader's own choice
         (r"Checkpoint directory .* exists and is not empty", UserWarning),  # a resumed run
         (r".*is smaller than the logging interval.*", UserWarning),
+        (r"Grad strides do not match bucket view strides", UserWarning),  # of 1x1 kernels, where both are one
         (
             r"It is recommended to use .*sync_dist=True",
             UserWarning,
@@ -245,6 +247,7 @@ class TrainingCLI(LightningCLI):
         except ValueError as error:
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
+        join_ranks(self.trainer)
 
     def _parse_ckpt_path(self) -> None:
         """Compare the checkpoint's network, and a critic that goes on training, with the configured ones.

@@ -16,11 +16,20 @@ class Workplace:
         # tests that run several processes do not fight for cores.
         self.environment = environment | {"OMP_NUM_THREADS": "1", "PENUMBRA_CACHE": str(cache)}
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
+    def _start(self, module: str, *arguments: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-m", "trainer", *arguments], cwd=self.folder, env=self.environment, text=True,
+            [sys.executable, "-m", module, *arguments], cwd=self.folder, env=self.environment, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
+
+    def torchrun(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start the command on two ranks that are started again when one ends."""
+        launcher = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "--max-restarts", "9")
+        return self._start(*launcher, "-m", "trainer", *arguments, "--trainer.devices", "2",
+                           "--trainer.strategy", "ddp", "--trainer.accelerator", "cpu")  # fmt: skip
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        return self._start("trainer", *arguments)
 
     def trainer(self, *arguments: str, code: int = 0) -> str:
         process = self.start(*arguments)

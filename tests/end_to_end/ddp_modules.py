@@ -73,9 +73,10 @@ def main():
     torch.set_num_threads(1)
     for name, arguments in jobs.items():
         if how == "joint":
-            extra = ["--data", f"{__spec__.name}.Joint"]
+            extra = ["--data", f"{__spec__.name}.Joint", "--trainer.limit_val_batches", str(2 * RANKS)]
         else:
             extra = ["--trainer.devices", str(RANKS), "--trainer.strategy", "ddp"]
+            extra += ["--trainer.limit_val_batches", "2"]
         sys.argv = ["trainer", *configs.resolve_arguments(arguments), *extra]
         cli = Recorded()
         if cli.trainer.is_global_zero:

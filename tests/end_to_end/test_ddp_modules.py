@@ -1,4 +1,4 @@
-"""Every training module, with every network that ships, learns on two ranks what it learns on joint batches."""
+"""Every training module, with every network that ships, learns on two ranks as on their joint batches."""
 
 import json
 import os
@@ -23,10 +23,11 @@ trainer: {logger: false, callbacks: [], enable_checkpointing: false, accelerator
 
 
 def job(name, overlay):
-    """Return arguments that train three steps of plain gradient descent and validate two uneven batches."""
+    """Return arguments that train three steps of plain gradient descent, and validate."""
     return [
         *arguments(name), "--config", str(overlay), "--trainer.limit_train_batches", "3",
-        "--trainer.limit_val_batches", "2", "--trainer.logger", "false", "--trainer.callbacks", "[]",
+        "--trainer.logger", "false", "--trainer.callbacks", "[]",
+        "--data.init_args.train_patches", "800", "--data.init_args.validation_patches", "450",
         "--data.init_args.sample_counts", "null",  # ranks may draw different numbers
     ]  # fmt: skip
 
@@ -51,6 +52,12 @@ def trained(tmp_path_factory, cache):
     }
 
 
+def moves(saved):
+    """Return how far each weight moved in training."""
+    before = {k: v for k, v in saved["before"].items() if v.is_floating_point()}
+    return {key: (saved["after"][key] - value).double() for key, value in before.items()}
+
+
 def test_every_training_module_is_trained():
     texts = [(configs.folder() / name).read_text() for name in NAMES]
     for module in trainer.modules.__all__:
@@ -61,18 +68,15 @@ def test_every_training_module_is_trained():
 @pytest.mark.parametrize("name", NAMES)
 def test_two_ranks_learn_what_one_process_learns_from_their_joint_batches(name, trained):
     joint, ranks = trained[name]["joint"], trained[name]["ranks"]
-    moved = 0
-    for key, after in joint["after"].items():
-        before = joint["before"][key]
-        assert torch.equal(before, ranks["before"][key]), key
-        if not after.is_floating_point():
-            continue
-        expected, found = after - before, ranks["after"][key] - before
-        moved += int(expected.abs().max() > 0)
-        # A weight moves by a multiple of its rounding, so small moves are known less exactly.
-        limit = 1e-3 * expected.abs().max() + 4 * torch.finfo(after.dtype).eps * before.abs()
-        assert ((expected - found).abs() <= limit).all(), key
-    assert moved > 0.9 * len(joint["after"])
+    expected, found = moves(joint), moves(ranks)
+    assert all(torch.equal(before, ranks["before"][key]) for key, before in joint["before"].items())
+    assert sum(bool(move.any()) for move in expected.values()) > len(expected) / 2
+    eps = torch.finfo(torch.float32).eps
+    for key, move in expected.items():  # sums over pixels and small moves of large weights are rounded
+        limit = 1e-2 * move.norm() + eps * joint["before"][key].norm()
+        assert (found[key] - move).norm() <= limit, key
+    whole, other = (torch.cat([v.flatten() for v in part.values()]) for part in (expected, found))
+    assert (other - whole).norm() <= 1e-3 * whole.norm()
     for key, value in joint["scores"].items():
         if key.startswith("val/"):
             assert ranks["scores"][key] == pytest.approx(value, rel=1e-3), key

@@ -149,9 +149,14 @@ def device_error():
         (database_error, "attempt to write a readonly database"),
         (device_error, "CUDA error: invalid device ordinal"),
         (lambda: AssertionError("Torch not compiled with CUDA enabled"), "not compiled with CUDA"),
+        (lambda: RuntimeError("pair.cc:537] Read error [127.0.0.1]:1: Connection reset by peer. Check"),
+         "another process of this training ended (Connection reset by peer)"),
+        (lambda: RuntimeError("DataLoader worker (pid 26894) is killed by signal: Killed. "),
+         "DataLoader worker (pid 26894) is killed by signal: Killed; if nobody ended it"),
+        (lambda: RuntimeError("DataLoader worker (pid(s) 1, 2) exited unexpectedly"), "ran out of memory"),
     ],
-)
-def test_failures_of_store_and_device_are_one_line_and_exit_1(monkeypatch, capsys, make, text):
+)  # fmt: skip
+def test_failures_of_the_surroundings_are_one_line_and_exit_1(monkeypatch, capsys, make, text):
     failing(monkeypatch, make())
     code, printed = run(monkeypatch, capsys, "fit")
     assert code == 1

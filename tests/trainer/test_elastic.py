@@ -1,0 +1,54 @@
+"""All ranks of an attempt agree on a name, whatever earlier attempts left in the store."""
+
+import threading
+from datetime import timedelta
+
+import pytest
+import torch.distributed as dist
+
+from trainer.elastic import agree
+
+
+def attempt(store, ranks, world, patience=timedelta(seconds=20)):
+    """Let some ranks of a world meet; returns the name that each got, or its error."""
+    names = {}
+
+    def run(rank):
+        try:
+            names[rank] = agree(store, rank, world, patience)
+        except (TimeoutError, dist.DistStoreError) as error:
+            names[rank] = error
+
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in ranks]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return names
+
+
+@pytest.fixture
+def store():
+    return dist.HashStore()
+
+
+def test_all_ranks_get_one_name(store):
+    names = attempt(store, range(4), 4)
+    assert len(names) == 4
+    assert len(set(names.values())) == 1
+
+
+def test_every_attempt_has_a_name_of_its_own(store):
+    assert len({attempt(store, range(3), 3)[0] for _ in range(5)}) == 5
+
+
+def test_words_of_ranks_that_were_killed_while_they_asked_do_no_harm(store):
+    attempt(store, [1, 2], 3, timedelta(seconds=0.2))
+    names = attempt(store, range(3), 3)
+    assert isinstance(names[0], str)
+    assert len(set(names.values())) == 1
+
+
+def test_rank_that_does_not_start_is_named(store):
+    names = attempt(store, [0, 2], 3, timedelta(seconds=0.2))
+    assert "ranks 1 of 3 did not start" in str(names[0])
