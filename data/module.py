@@ -245,11 +245,6 @@ class Shards(LightningDataModule):
         if self.index.count(split) == 0:
             return []
         rank, world = self._place()
-        if self.index.count(split) < world:
-            # A rank without a batch would leave the others waiting for its share of the metrics.
-            raise ValueError(
-                f"{self.index.count(split)} {split} samples for {world} processes; use fewer devices"
-            )
         loader = EvaluationLoader(
             self._batches(split, None),
             batch_size,

@@ -114,11 +114,15 @@ def download(
         _check(path, size, sha256)
 
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent} does not exist; make the folder that {shown(url)} is read into")
+        raise FileNotFoundError(
+            f"{path.parent} does not exist; make the folder that {shown(url)} is read into"
+        )
     try:
         patiently("read", url, attempt)
     except ContentError as error:
-        raise ValueError(f"{shown(url)} is not what it should be: {error}; it was read several times") from error
+        raise ValueError(
+            f"{shown(url)} is not what it should be: {error}; it was read several times"
+        ) from error
 
 
 def read_bytes(url: str, limit: int) -> bytes:
@@ -320,9 +324,7 @@ def _system(url: str) -> Any:
 def _make(scheme: str) -> Any:
     needed = {"s3": "s3fs", "http": "aiohttp", "https": "aiohttp"}.get(scheme, "fsspec")
     if importlib.util.find_spec(needed) is None:
-        raise ValueError(
-            f"{scheme}:// needs the package {needed}: pip install \"penumbra-denoise[remote]\""
-        )
+        raise ValueError(f'{scheme}:// needs the package {needed}: pip install "penumbra-denoise[remote]"')
     import fsspec
 
     options: dict[str, Any] = {"skip_instance_cache": True}
@@ -343,9 +345,7 @@ def _make(scheme: str) -> Any:
     elif scheme in ("http", "https"):
         import aiohttp
 
-        timeout = aiohttp.ClientTimeout(
-            total=None, sock_connect=CONNECT_TIMEOUT_S, sock_read=READ_TIMEOUT_S
-        )
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_TIMEOUT_S, sock_read=READ_TIMEOUT_S)
         options |= {
             "client_kwargs": {"timeout": timeout, "trust_env": True},
             "headers": {"Accept-Encoding": "identity"},

@@ -13,7 +13,9 @@ import socket
 from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
-Kind = Literal["again", "unknown host", "missing", "no bucket", "expired", "clock", "refused", "wrong", "here"]
+Kind = Literal[
+    "again", "unknown host", "missing", "no bucket", "expired", "clock", "refused", "wrong", "here"
+]
 """`again`: a later attempt may succeed; `refused`: credentials are missing or do not allow it; `wrong`: the
 server does not accept the request; `here`: this machine failed, as with a full disk."""
 

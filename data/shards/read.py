@@ -236,9 +236,7 @@ class ShardReader:
         record = where.samples[place]
         for _ in range(ATTEMPTS):
             try:
-                data = remote.read_range(
-                    remote.join(self.cache.url, where.file), record.offset, record.size
-                )
+                data = remote.read_range(remote.join(self.cache.url, where.file), record.offset, record.size)
             except FileNotFoundError as error:
                 raise self._corrupt(number, f"the file is missing ({error})") from error
             except ValueError as error:

@@ -275,11 +275,18 @@ def test_a_buffer_that_the_shards_lack_names_the_command(index: Index):
         module(index, buffers=("motion",)).train_dataloader()
 
 
-def test_fewer_evaluation_samples_than_ranks_is_an_error(index: Index, monkeypatch: pytest.MonkeyPatch):
+def test_rank_for_which_no_evaluation_sample_is_left_has_a_batch_that_counts_nowhere(
+    index: Index, monkeypatch: pytest.MonkeyPatch
+):
     shards = module(index)
-    monkeypatch.setattr(shards, "_place", lambda: (0, 1000))
-    with pytest.raises(ValueError, match="test samples for 1000 processes; use fewer devices"):
-        shards.test_dataloader()
+    total = shards.counts()["test"]
+    monkeypatch.setattr(shards, "_place", lambda: (total, total + 1))
+    (batch,) = list(shards.test_dataloader())
+    assert batch["scene"] == batch["key"] == []
+    assert batch["reference"].shape[0] == 1
+    monkeypatch.setattr(shards, "_place", lambda: (total - 1, total + 1))
+    (batch,) = list(shards.test_dataloader())
+    assert len(batch["scene"]) == len(batch["key"]) == 1
 
 
 def test_more_ranks_than_shards_is_an_error(index: Index, monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,6 @@
 """Two processes train as one does on the same global batches."""
 
+import pytest
 import torch
 
 OPTIONS = (
@@ -66,3 +67,27 @@ def test_two_gloo_processes_end_with_the_weights_of_one(workplace, cache):
     for name, tensor in expected.items():
         found = checkpoint["state_dict"][f"net.{name}"]
         assert torch.allclose(found, tensor, rtol=1e-4, atol=1e-5), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("candidates", [160, 80], ids=["three", "fewer than ranks"])
+def test_two_ranks_validate_few_samples_with_a_network_that_has_buffers(workplace, candidates):
+    """Ranks have different numbers of batches, one of them perhaps none, and neither waits for the other."""
+    common = (
+        "--config", "wskp_bmfr.yaml", "--model.init_args.net", "tests.end_to_end.normalised.Normalised",
+        "--data.init_args.root", "sample:stills", "--data.init_args.recipe", "afgsa",
+        "--data.init_args.train_patches", str(candidates), "--data.init_args.patch_size", "64",
+        "--data.init_args.batch_size", "1", "--trainer.accelerator", "cpu",
+    )  # fmt: skip
+    best = "{class_path: trainer.callbacks.BestCheckpoint, init_args: {monitor: val/loss, mode: min}}"
+    two = ("--trainer.devices", "2", "--trainer.strategy", "ddp")
+    workplace.trainer("fit", *common, *two, "--trainer.max_epochs", "2", "--trainer.limit_train_batches",
+                      "2", "--trainer.callbacks", f"[{best}]")  # fmt: skip
+    shared = scores(workplace.trainer("validate", *common, *two))
+    alone = scores(workplace.trainer("validate", *common))
+    assert shared == alone != []
+
+
+def scores(printed):
+    """Return the rows of the table of scores."""
+    return [line for line in printed.splitlines() if "indoor" in line or "outdoor" in line]

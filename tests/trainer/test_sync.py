@@ -12,7 +12,15 @@ import pytest
 
 from models import WSKP
 from tests.tracking_server import free_port
-from tests.trainer.test_tracking import assert_complete, continued, history, killed, logger, record_all, stored
+from tests.trainer.test_tracking import (
+    assert_complete,
+    continued,
+    history,
+    killed,
+    logger,
+    record_all,
+    stored,
+)
 from trainer.commands import sync, upload
 from trainer.configs import UsageError
 from trainer.export import export

@@ -8,6 +8,7 @@ from typing import Any
 
 from lightning.pytorch import LightningModule
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 from models.denoiser import Denoised, Denoiser, select
 from trainer.metrics.collection import METRICS, SceneMetrics
@@ -67,6 +68,19 @@ class Evaluated(LightningModule):
         """
         raise TypeError(f"{type(self).__name__} does not define validation_loss")
 
+    def on_validation_start(self) -> None:
+        """Do not send buffers of the network with each batch: ranks may have one batch more or less."""
+        self._send_buffers(False)
+
+    def on_validation_end(self) -> None:
+        """Send buffers again where training goes on."""
+        self._send_buffers(True)
+
+    def _send_buffers(self, send: bool) -> None:
+        model = self.trainer.strategy.model
+        if isinstance(model, DistributedDataParallel):
+            model.require_forward_param_sync = send
+
     def on_validation_epoch_start(self) -> None:
         """Start new sums."""
         self.scores = self._new_scores("validation")
@@ -75,7 +89,7 @@ class Evaluated(LightningModule):
         """Score one batch of fixed crops."""
         output, target = self.exposed(batch)
         loss = self.validation_loss(batch, output, target)
-        self.log("val/loss", loss, batch_size=len(target), sync_dist=True)
+        self.log("val/loss", loss, batch_size=len(batch["scene"]), sync_dist=True)
         assert self.scores is not None
         self.scores.update(output, target, batch["scene"])
 
