@@ -10,7 +10,7 @@ BIN = $(VENV)/bin
 READY = $(VENV)/.ready
 DEV_READY = $(VENV)/.ready-dev
 
-.PHONY: fit test test-all lint format bench clean
+.PHONY: fit test test-all lint format bench soak fuzz clean
 
 fit: $(READY)
 	$(BIN)/trainer fit --config wskp_bmfr.yaml
@@ -34,6 +34,14 @@ format: $(DEV_READY)
 
 bench: $(DEV_READY)
 	$(BIN)/python -m tests.benchmarks
+
+# Half an hour: a training of which 30 processes are killed, with its servers.
+soak: $(DEV_READY)
+	$(BIN)/python -m tests.benchmarks.soak
+
+# Readers of files from outside, 20,000 mutated inputs for each format.
+fuzz: $(DEV_READY)
+	$(BIN)/python -m tests.fuzz --count 20000
 
 $(VENV)/.torch:
 	$(PYTHON) -m venv $(VENV)

@@ -26,6 +26,7 @@ MODULES = (
     *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "stills_quality"),
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
     *("nfor", "nfor_growth", "nlm", "classical_quality", "flicker"),
+    *("scaling", "remote", "outage", "serve"),
 )
 RESULTS = Path("bench") / "results.json"
 
