@@ -12,7 +12,15 @@ import pytest
 
 from models import WSKP
 from tests.tracking_server import free_port
-from tests.trainer.test_tracking import assert_complete, continued, history, killed, logger, record_all, stored
+from tests.trainer.test_tracking import (
+    assert_complete,
+    continued,
+    history,
+    killed,
+    logger,
+    record_all,
+    stored,
+)
 from trainer.commands import sync, upload
 from trainer.configs import UsageError
 from trainer.export import export
@@ -203,7 +211,7 @@ def test_model_is_registered_once_for_the_same_weights_whatever_breaks_away(work
     versions = client.search_model_versions(f"name = '{name}'")
     assert [(v.version, v.run_id, v.status) for v in versions] == [("1", log.run_id, "READY")]
     models = client.search_logged_models([stored(log).info.experiment_id])
-    assert [model.model_id for model in models] == [versions[0].model_id]
+    assert [f"models:/{model.model_id}" for model in models] == [versions[0].source]
     assert capsys.readouterr().err.count(f"registered models:/{name}/1") == 1
 
 
