@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.util
 import os
 import tempfile
 import threading
@@ -21,19 +20,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from data.remote_failures import ContentError
-from data.remote_patience import endpoint, patiently, shown
+from data.remote_patience import patiently, shown
+from data.remote_systems import counter, http_delete, http_range, inner, is_http, run, system_of
 
 SCHEMES = ("s3", "http", "https", "memory", "file")
-CONNECT_TIMEOUT_S, READ_TIMEOUT_S = 10, 30
-"""Longest waits for a connection, and for the next piece of an answer."""
 SHA256 = "penumbra-sha256"
 """Name under which S3 keeps the checksum of what was sent."""
-PIECE = 1 << 23
-"""Bytes of an S3 file that are read in one request; up to `TOGETHER` of them at one time, so 32 MiB of memory."""
-TOGETHER = 4
-
-_lock = threading.Lock()
-_systems: dict[tuple[Any, ...], Any] = {}
 
 
 def is_url(text: str | Path) -> bool:
@@ -110,7 +102,7 @@ def download(
     limit = size if limit is None else limit
 
     def attempt() -> None:
-        _system(url).get_file(_inner(url), str(path), callback=_counter(limit, report))
+        system_of(url).get_file(inner(url), str(path), callback=counter(limit, report))
         _check(path, size, sha256)
 
     if not path.parent.is_dir():
@@ -151,11 +143,11 @@ def read_range(url: str, start: int, size: int) -> bytes | None:
     """
 
     def attempt() -> bytes | None:
-        system = _system(url)
-        if _is_http(url):
-            data: bytes | None = _run(system, _http_range(system, url, start, size))
+        system = system_of(url)
+        if is_http(url):
+            data: bytes | None = run(system, http_range(system, url, start, size))
         else:
-            data = system.cat_file(_inner(url), start=start, end=start + size)
+            data = system.cat_file(inner(url), start=start, end=start + size)
         if data is not None and len(data) != size:
             raise ContentError(f"{len(data)} bytes arrived from byte {start} on, expected {size}")
         return data
@@ -182,14 +174,14 @@ def send(path: Path, url: str, *, report: Callable[[int], None] | None = None) -
     options: dict[str, Any] = {}
     if url.startswith("s3:"):
         options["Metadata"] = {SHA256: digest}
-    elif _is_http(url):
+    elif is_http(url):
         options["method"] = "put"
 
     def attempt() -> None:
-        system = _system(url)
+        system = system_of(url)
         if not options:
-            system.makedirs(system._parent(_inner(url)), exist_ok=True)
-        system.put_file(str(path), _inner(url), callback=_counter(None, report), **options)
+            system.makedirs(system._parent(inner(url)), exist_ok=True)
+        system.put_file(str(path), inner(url), callback=counter(None, report), **options)
         there = _size(url)
         if there != size:
             raise ContentError(f"{size} bytes were sent and {there} are there")
@@ -225,9 +217,9 @@ def size_of(url: str) -> int | None:
 
 
 def _size(url: str) -> int | None:
-    system = _system(url)
+    system = system_of(url)
     system.invalidate_cache()
-    found = system.info(_inner(url))
+    found = system.info(inner(url))
     if found.get("type") == "directory":
         raise FileNotFoundError(f"{shown(url)} is a folder")
     return None if found.get("size") is None else int(found["size"])
@@ -242,7 +234,7 @@ def sha256_of(url: str) -> str | None:
         OSError: As `fetch`.
     """
     if url.startswith("s3:"):
-        found: Any = patiently("read", url, lambda: _system(url).metadata(_inner(url), refresh=True))
+        found: Any = patiently("read", url, lambda: system_of(url).metadata(inner(url), refresh=True))
         return {str(name).lower(): str(value) for name, value in found.items()}.get(SHA256)
     with tempfile.TemporaryDirectory(prefix="penumbra-") as folder:
         download(url, Path(folder) / "file")
@@ -256,16 +248,16 @@ def listing(url: str) -> dict[str, int] | None:
         FileNotFoundError: There is no such bucket; a folder that does not exist is empty.
         OSError: As `fetch`.
     """
-    if _is_http(url):
+    if is_http(url):
         return None
 
     def attempt() -> list[dict[str, Any]]:
-        system = _system(url)
+        system = system_of(url)
         system.invalidate_cache()
         if url.startswith("s3:"):  # a folder without files is no error, a missing bucket is
             system.call_s3("list_objects_v2", Bucket=urlsplit(url).netloc, MaxKeys=1)
         try:
-            return list(system.ls(_inner(url), detail=True))
+            return list(system.ls(inner(url), detail=True))
         except FileNotFoundError:
             return []
 
@@ -283,11 +275,11 @@ def remove(url: str) -> None:
     """
 
     def attempt() -> None:
-        system = _system(url)
-        if _is_http(url):
-            _run(system, _http_delete(system, url))
+        system = system_of(url)
+        if is_http(url):
+            run(system, http_delete(system, url))
         else:
-            system.rm_file(_inner(url))
+            system.rm_file(inner(url))
 
     with contextlib.suppress(FileNotFoundError):
         patiently("remove", url, attempt)
@@ -299,83 +291,6 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _is_http(url: str) -> bool:
-    return url.startswith(("http:", "https:"))
-
-
-def _inner(url: str) -> str:
-    """Return what the file system calls a file: S3 without scheme, where `?` would begin a version."""
-    return url.partition("://")[2] if url.startswith("s3:") else url
-
-
-def _system(url: str) -> Any:
-    """Return the file system of a URL, made once in each process.
-
-    Its connections are served by a thread, which a forked process does not have.
-    """
-    scheme = url.partition("://")[0]
-    key = (os.getpid(), scheme, endpoint() if scheme == "s3" else None)
-    with _lock:
-        if key not in _systems:
-            _systems[key] = _make(scheme)
-        return _systems[key]
-
-
-def _make(scheme: str) -> Any:
-    needed = {"s3": "s3fs", "http": "aiohttp", "https": "aiohttp"}.get(scheme, "fsspec")
-    if importlib.util.find_spec(needed) is None:
-        raise ValueError(f'{scheme}:// needs the package {needed}: pip install "penumbra-denoise[remote]"')
-    import fsspec
-
-    options: dict[str, Any] = {"skip_instance_cache": True}
-    if scheme == "s3":
-        region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
-        client: dict[str, Any] = {"region_name": region} if region else {}
-        if endpoint():
-            client["endpoint_url"] = endpoint()
-        config: dict[str, Any] = {
-            "connect_timeout": CONNECT_TIMEOUT_S,
-            "read_timeout": READ_TIMEOUT_S,
-            "retries": {"total_max_attempts": 1},  # `patiently` tries again
-        }
-        if endpoint():  # stores of one's own rarely have a host name for each bucket
-            config["s3"] = {"addressing_style": "path"}
-        options |= {"client_kwargs": client, "config_kwargs": config, "use_listings_cache": False}
-        options |= {"default_block_size": PIECE, "max_concurrency": TOGETHER}
-    elif scheme in ("http", "https"):
-        import aiohttp
-
-        timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_TIMEOUT_S, sock_read=READ_TIMEOUT_S)
-        options |= {
-            "client_kwargs": {"timeout": timeout, "trust_env": True},
-            "headers": {"Accept-Encoding": "identity"},
-        }
-    system = fsspec.filesystem(scheme, **options)
-    if scheme == "s3":
-        system.retries = 1
-    return system
-
-
-def _counter(limit: int | None, report: Callable[[int], None] | None) -> Any:
-    """Return what counts the pieces of a transfer, and ends it where there are too many."""
-    from fsspec.callbacks import Callback
-
-    class Counter(Callback):
-        def set_size(self, size: int | None) -> None:
-            super().set_size(size)
-            if limit is not None and size is not None and size > limit:
-                raise ContentError(f"it has {size} bytes, expected at most {limit}")
-
-        def relative_update(self, inc: int = 1) -> None:
-            super().relative_update(inc)
-            if report is not None:
-                report(inc)
-            if limit is not None and self.value > limit:
-                raise ContentError(f"it has more than {limit} bytes")
-
-    return Counter()
-
-
 def _check(path: Path, size: int | None, sha256: str | None) -> None:
     found = path.stat().st_size
     if size is not None and found != size:
@@ -384,26 +299,3 @@ def _check(path: Path, size: int | None, sha256: str | None) -> None:
         digest = file_sha256(path)
         if digest != sha256:
             raise ContentError(f"its checksum is {digest[:12]}…, expected {sha256[:12]}…")
-
-
-def _run(system: Any, coroutine: Any) -> Any:
-    from fsspec.asyn import sync
-
-    return sync(system.loop, lambda: coroutine)
-
-
-async def _http_range(system: Any, url: str, start: int, size: int) -> bytes | None:
-    session = await system.set_session()
-    headers = {"Range": f"bytes={start}-{start + size - 1}", "Accept-Encoding": "identity"}
-    async with session.get(system.encode_url(url), headers=headers) as answer:
-        answer.raise_for_status()
-        if answer.status != 206:
-            return None
-        data: bytes = await answer.content.readexactly(size)
-        return data
-
-
-async def _http_delete(system: Any, url: str) -> None:
-    session = await system.set_session()
-    async with session.delete(system.encode_url(url)) as answer:
-        answer.raise_for_status()

@@ -1,8 +1,8 @@
 """What a failed request means: wait and try again, or tell, and how.
 
-Servers and libraries report one thing in many ways. It is judged by the HTTP status and the code of S3 that
-lie at the bottom of an exception, and by its class where there was no answer. Classes are known by name, since
-the libraries are imported only where they are used.
+Servers and libraries report one thing in many ways. It is judged by the HTTP status and the code of S3 at the
+bottom of an exception, and by its class where there was no answer. Classes are known by name, since the
+libraries are imported only where they are used.
 """
 
 from __future__ import annotations

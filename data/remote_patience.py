@@ -33,6 +33,15 @@ _reached: set[str] = set()
 _told: dict[str, float] = {}
 
 
+def _renew_lock() -> None:
+    """Give a forked process a lock that no thread of its parent holds."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_renew_lock)
+
+
 def patience_s() -> float:
     """Return for how many seconds a request is tried: `$PENUMBRA_REMOTE_PATIENCE`, by default 300.
 

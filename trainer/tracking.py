@@ -284,14 +284,15 @@ class MLflowTracking(Logger):
             return
         uri = self._begin_record()
         self._recorded = Recorded.of(self.folder)
-        self._journal = Journal(self.folder, self._recorded.last_ms)
+        folder = self.folder.resolve()  # the current directory may change
+        self._journal = Journal(folder, self._recorded.last_ms)
         if not self._recorded.id:
             self._append({"type": "run", "id": uuid.uuid4().hex})
         if not self.evaluation:
             self._append({"type": "status", "status": "RUNNING"})
         quiet_mlflow(retries=0)
         load_mlflow(uri)
-        self._sender = Sender(self.folder, self._journal)
+        self._sender = Sender(folder, self._journal)
         self._sender.start()
         atexit.register(self._close)
         if self.system_metrics:

@@ -4,8 +4,8 @@
     $PENUMBRA_CACHE/remote/.SHA256.BYTES.partial   one that is being downloaded, and the room it will take
 
 Who downloads a shard holds an exclusive lock of its partial file, so no other process does it too; the system
-releases it however that process ends. Who reads a shard holds a shared lock of it as long as it is mapped, and
-only shards that nobody holds are removed, the longest unused first. (On Linux a file that is removed anyway,
+releases it however that process ends. Who reads a shard holds a shared lock as long as it is mapped, and only
+shards that nobody holds are removed, the longest unused first. (On Linux a file that is removed anyway,
 by hand, stays readable for those who have it mapped.) Files get their names when they are complete.
 """
 
@@ -131,8 +131,8 @@ class ShardCache:
             cause = error.__cause__
             if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise OSError(
-                    f"no room for {remote.shown(source)} in {self.folder}: {cause.strerror}; make room, lower "
-                    "--data.cache_gb, or set PENUMBRA_CACHE to a folder on another disk"
+                    f"no room for {remote.shown(source)} in {self.folder}: {cause.strerror}; make room, "
+                    "lower --data.cache_gb, or set PENUMBRA_CACHE to a folder on another disk"
                 ) from error
             raise
 

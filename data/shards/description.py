@@ -24,8 +24,8 @@ LARGEST_SIDE = 1 << 17
 
 
 class Stored(NamedTuple):
-    """Where an array of a sample lies: type, shape, (C, H, W) or (S, C, H, W), and first value counted in that
-    type from the beginning of the sample."""
+    """Where an array of a sample lies: type, shape, (C, H, W) or (S, C, H, W), and first value, counted in
+    that type from the beginning of the sample."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]

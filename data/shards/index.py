@@ -1,7 +1,7 @@
 """The index of a folder of shards: what is in which file, where, and with which checksum.
 
-It is not trusted: names cannot leave the folder, samples lie inside their shard and beside each other. An index
-has at most `LARGEST` bytes, and reading it takes at most about thirty times as many as it has.
+It is not trusted: names cannot leave the folder, samples lie inside their shard and beside each other. An
+index has at most `LARGEST` bytes, and reading it takes at most about thirty times as many as it has.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class ShardRecord:
         size = whole(record["bytes"], f"bytes of {file}", 0, LARGEST_SHARD)
         kept = record.get("per_sample")
         per_sample = None if kept is None else _per_sample(*kept)
-        known = {"file": file, "split": record["split"], "scene": text(record["scene"], "scene")}
+        known = {"file": file, "split": str(record["split"]), "scene": text(record["scene"], "scene")}
         counts = {name: whole(record.get(name, 0), name, 0, 2**48) for name in ("skipped", "pruned")}
         unknown = record.keys() - known.keys() - counts.keys() - {"sha256", "bytes", "samples", "per_sample"}
         if unknown:
@@ -90,7 +90,8 @@ class ShardRecord:
             bytes=size,
             samples=_samples(file, record["samples"], size),
             per_sample=per_sample,
-            **counts,
+            skipped=counts["skipped"],
+            pruned=counts["pruned"],
         )
 
     def to_dict(self) -> dict[str, Any]:

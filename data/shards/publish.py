@@ -54,7 +54,7 @@ def publish(
         processes: Number of processes that cut.
         force: Replace shards that are there already.
         cutting: Called now and then with the samples that are cut and their total.
-        sending: Called when sending begins; returns what is told the megabytes that are there and their total.
+        sending: Called when sending begins; returns what is told the megabytes that are there, and all.
 
     Returns:
         The index of the set at the URL.

@@ -1,8 +1,8 @@
 """Reads shards straight to a sample by the index, with checksums: through memory maps, or over the network.
 
 Of shards at a URL whole copies are mapped as far as they are here already and the cache holds them
-(`data.shards.cache`); samples of the others are read by themselves, in ranges of bytes. Where a server does not
-give ranges, who wants a sample waits for its shard.
+(`data.shards.cache`); samples of the others are read by themselves, in ranges of bytes. Where a server does
+not give ranges, who wants a sample waits for its shard.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 A small WSKP training with Lightning records every step (ten times as often as by default). It runs in blocks
 of each kind in turn, in a new order every round, and a round's medians are compared with each other, so that
-all kinds meet the same load of the machine. Servers are MLflow's own application in processes of their own; the
-slow one answers everything two seconds late, and where none is there connections are refused. System metrics
-are on.
+all kinds meet the same load of the machine. Servers are MLflow's own application in processes of their own;
+the slow one answers everything two seconds late, and where none is there connections are refused. System
+metrics are on.
 
     python -m tests.benchmarks.outage
 """

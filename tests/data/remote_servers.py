@@ -41,7 +41,8 @@ class S3Server:
         self.folder.mkdir(exist_ok=True)
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(
-                [WEED, "server", f"-dir={self.folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", *ports, "-filer",
+                [WEED, "server", f"-dir={self.folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", *ports,
+                 "-filer",
                  "-s3", "-s3.iam=false", "-s3.port.iceberg=0", "-s3.port.lance=0", "-master.telemetry=false",
                  "-master.volumeSizeLimitMB=64", "-volume.max=100", "-volume.minFreeSpace=0"],
                 env={**os.environ, **self.environment}, stdout=log, stderr=log, start_new_session=True,
@@ -85,7 +86,8 @@ def bucket_command(environment: dict[str, str], name: str, bucket: str | None = 
         aws_access_key_id=environment["AWS_ACCESS_KEY_ID"],
         aws_secret_access_key=environment["AWS_SECRET_ACCESS_KEY"],
         config=botocore.config.Config(
-            s3={"addressing_style": "path"}, retries={"total_max_attempts": 1}, connect_timeout=2, read_timeout=10
+            s3={"addressing_style": "path"}, retries={"total_max_attempts": 1}, connect_timeout=2,
+            read_timeout=10,
         ),
     )  # fmt: skip
     try:
@@ -172,10 +174,10 @@ class Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(body)
 
-    def do_HEAD(self) -> None:  # noqa: N802
+    def do_HEAD(self) -> None:
         self.do_GET()
 
-    def do_GET(self) -> None:  # noqa: N802
+    def do_GET(self) -> None:
         self.web.asked[f"{self.command} {self.path}"] += 1
         if not self.file.is_file():
             self.answer(404, b"not here")
@@ -191,7 +193,7 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self.answer(200, data)
 
-    def do_PUT(self) -> None:  # noqa: N802
+    def do_PUT(self) -> None:
         self.web.asked[f"PUT {self.path}"] += 1
         body = b""
         if self.headers.get("Transfer-Encoding") == "chunked":
@@ -205,7 +207,7 @@ class Handler(BaseHTTPRequestHandler):
         self.file.write_bytes(body)
         self.answer(201)
 
-    def do_DELETE(self) -> None:  # noqa: N802
+    def do_DELETE(self) -> None:
         self.web.asked[f"DELETE {self.path}"] += 1
         found = self.file.is_file()
         self.file.unlink(missing_ok=True)

@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
-from data import remote, remote_patience
+from data import remote, remote_patience, remote_systems
 from data.remote_failures import ContentError, judge
+from data.remote_systems import system_of
 from tests.data.remote_servers import Handler, S3Server, WebServer, free_ports
 
 DATA = bytes(range(256)) * 5000
@@ -190,8 +191,8 @@ def test_a_server_that_never_recovers_is_left_with_address_attempts_and_time(
 
 
 def test_a_silent_server_counts_as_failing(web: WebServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.setattr(remote, "READ_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(remote, "_systems", {})
+    monkeypatch.setattr(remote_systems, "READ_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(remote_systems, "_systems", {})
 
     def silent(handler: Handler, data: bytes) -> bool:
         time.sleep(0.6)
@@ -263,11 +264,11 @@ def test_a_missing_bucket_and_missing_credentials_are_named(bucket: str, monkeyp
         FileNotFoundError, match=r"http://127.0.0.1:\d+ has no bucket 'nothing'; .*make the bucket"
     ):
         remote.listing("s3://nothing/x")
-    monkeypatch.setattr(remote, "_systems", {})
+    monkeypatch.setattr(remote_systems, "_systems", {})
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
-    with pytest.raises(PermissionError, match="signature.*check AWS_ACCESS_KEY_ID"):
+    with pytest.raises(PermissionError, match=r"signature.*check AWS_ACCESS_KEY_ID"):
         remote.listing("s3://bucket/x")
-    monkeypatch.setattr(remote, "_systems", {})
+    monkeypatch.setattr(remote_systems, "_systems", {})
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nowhere")
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
@@ -337,7 +338,7 @@ def test_a_full_disk_is_not_taken_for_the_server(
     def full(*args: Any, **options: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(remote._system(web.url), "get_file", full)
+    monkeypatch.setattr(system_of(web.url), "get_file", full)
     with pytest.raises(OSError, match=r"cannot read .*: No space left on device; make room"):
         remote.fetch(f"{web.url}/file", tmp_path / "f")
 
@@ -352,13 +353,13 @@ def test_bugs_are_not_waited_for():
 @pytest.mark.parametrize("text", ["soon", "-1", "nan", "inf"])
 def test_a_patience_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch, text: str):
     monkeypatch.setenv(remote_patience.PATIENCE, text)
-    with pytest.raises(ValueError, match="PENUMBRA_REMOTE_PATIENCE is .*expected seconds"):
+    with pytest.raises(ValueError, match=r"PENUMBRA_REMOTE_PATIENCE is .*expected seconds"):
         remote_patience.patience_s()
 
 
 def test_a_missing_extra_names_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(remote, "_systems", {})
-    monkeypatch.setattr(remote.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(remote_systems, "_systems", {})
+    monkeypatch.setattr(remote_systems.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(
         ValueError, match=r's3:// needs the package s3fs: pip install "penumbra-denoise\[remote\]"'
     ):

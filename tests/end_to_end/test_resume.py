@@ -14,6 +14,7 @@ from trainer.tracking import open_client
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "3", "--trainer.limit_train_batches", "7",
     "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "2",
+    "--trainer.log_every_n_steps", "1",
 )  # fmt: skip
 CALLBACKS = """
 trainer:
@@ -57,14 +58,20 @@ def test_killed_run_continues_in_its_mlflow_run_with_identical_weights(workplace
     workplace.trainer("fit", *options(workplace), "--ckpt_path", "last")
 
     assert len(workplace.runs) == 1
-    assert RunRecord.load(workplace.runs[0]).run_id == before.run_id
+    after = RunRecord.load(workplace.runs[0])
+    assert before.run_id in (None, after.run_id)  # a very early kill comes before the store's first answer
     resumed = final(workplace)
     assert resumed["global_step"] == uninterrupted["global_step"] == 21
     for name, tensor in uninterrupted["state_dict"].items():
         assert torch.equal(tensor, resumed["state_dict"][name]), name
     assert_equal_trees(uninterrupted["optimizer_states"], resumed["optimizer_states"])
-    run = open_client(before.tracking_uri).get_run(before.run_id)
+    client = open_client(after.tracking_uri)
+    run = client.get_run(after.run_id)
     assert run.info.status == "FINISHED"
+    assert len(client.search_runs([run.info.experiment_id])) == 1
+    for key, steps in (("train/loss_step", range(21)), ("val/psnr_wskp", (6, 13, 20))):
+        history = client.get_metric_history(after.run_id, key)
+        assert sorted(metric.step for metric in history) == list(steps), key
 
 
 def wait_for_step(place, step, process):

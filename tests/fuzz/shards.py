@@ -5,7 +5,7 @@
 
 Inputs are made from small sets: an index and the tar files that it names. Values of the index and of the
 descriptions in the tar files are replaced by others, bytes are turned, cut, doubled; most often the checksums
-are made to fit afterwards, so that readers get to see what was altered. Each input goes through what training,
+are made to fit afterwards, so that readers see what was altered. Each input goes through what training,
 validation and `trainer inspect` do with shards. That happens in processes that may take `BOUND` bytes more
 memory than they have at their start and `SECONDS` for an input; their end by a signal, another exception than
 ValueError, and running out of either is a violation.
@@ -166,7 +166,7 @@ def _altered(chance: random.Random, values: Any) -> Any:
         steps = (-1, 1, 2, -2, 64, -64, 512, -512, 1 << 20, -old, old)
         ways += [lambda: old + chance.choice(steps)] * 5
     if isinstance(old, list) and old:
-        ways += [lambda: old[:-1], lambda: old + [copy.deepcopy(old[0])], lambda: old[::-1]]
+        ways += [lambda: old[:-1], lambda: [*old, copy.deepcopy(old[0])], lambda: old[::-1]]
     if isinstance(holder, dict) and chance.random() < 0.1:
         del holder[key]
         if chance.random() < 0.5:

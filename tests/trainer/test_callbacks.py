@@ -71,11 +71,12 @@ def second_rank(monkeypatch, first):
 
 
 @pytest.fixture
-def first_rank(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def first_rank(workplace, monkeypatch):
     logger = MLflowTracking("exp", system_metrics=False)
     assert logger.folder.is_dir()
-    return logger
+    yield logger
+    monkeypatch.setattr(rank_zero_only, "rank", 0)
+    logger.finalize("failed")
 
 
 def test_other_ranks_save_into_the_first_ranks_folder_and_create_none(first_rank, monkeypatch):
@@ -198,22 +199,39 @@ def test_flattened_configuration_has_dotted_names_and_no_empty_values():
     assert flatten(tree) == {"a.b": 1, "list": "x.Y, z.W"}
 
 
-def test_resumed_configurations_lie_beside_the_first_in_folder_and_run(first_rank, monkeypatch):
+def test_resumed_configurations_lie_beside_the_first_in_folder_and_run(first_rank, monkeypatch, capsys):
     monkeypatch.setattr(recorder, "installed", lambda: ["penumbra==1"])
     module = Regression(WSKP(layers=3))
     for number in range(3):
         logger = first_rank if number == 0 else MLflowTracking("exp", resume_from=str(first_rank.folder))
         logger.system_metrics = False
-        parser = SimpleNamespace(dump=lambda config, skip_none: str(config))
+        parser = SimpleNamespace(dump=lambda config, skip_none: f"seed: {config.seed}")
         config = Namespace(seed=number)
         trainer = SimpleNamespace(logger=logger, datamodule=Synthetic())
         RunRecorder(parser, config, save_to_log_dir=False).save_config(trainer, module, "fit")
+        logger.finalize("success")
     names = ("config.yaml", "config-resumed-1.yaml", "config-resumed-2.yaml")
-    texts = [str(Namespace(seed=number)) for number in range(3)]
+    texts = [f"seed: {number}" for number in range(3)]
     assert [(first_rank.folder / name).read_text() for name in names] == texts
     client = open_client(first_rank.uri)
     stored = [client.download_artifacts(first_rank.run_id, name) for name in names]
     assert [Path(path).read_text() for path in stored] == texts
+    run = client.get_run(first_rank.run_id)
+    assert run.data.params == {"seed": "0"}
+    assert run.data.tags["changed.config-resumed-2"] == "seed: 0 → 2"
+    assert "seed: 0 → 1" in capsys.readouterr().err
+
+
+def test_run_that_continues_as_it_was_keeps_no_second_configuration(first_rank, monkeypatch, capsys):
+    monkeypatch.setattr(recorder, "installed", lambda: ["penumbra==1"])
+    for resume_from in (None, str(first_rank.folder)):
+        parser = SimpleNamespace(dump=lambda config, skip_none: f"lr: 1\nckpt_path: {config.resume_from}")
+        config = Namespace(lr=1, resume_from=resume_from)
+        trainer = SimpleNamespace(logger=first_rank, datamodule=Synthetic())
+        module = Regression(WSKP(layers=3))
+        RunRecorder(parser, config, save_to_log_dir=False).save_config(trainer, module, "fit")
+    assert [path.name for path in first_rank.folder.glob("*.yaml")] == ["config.yaml"]
+    assert "other values" not in capsys.readouterr().err
 
 
 def test_record_of_the_environment_lists_what_is_installed_and_the_commit(tmp_path):

@@ -211,7 +211,7 @@ def test_model_is_registered_once_for_the_same_weights_whatever_breaks_away(work
     versions = client.search_model_versions(f"name = '{name}'")
     assert [(v.version, v.run_id, v.status) for v in versions] == [("1", log.run_id, "READY")]
     models = client.search_logged_models([stored(log).info.experiment_id])
-    assert [model.model_id for model in models] == [versions[0].model_id]
+    assert [f"models:/{model.model_id}" for model in models] == [versions[0].source]
     assert capsys.readouterr().err.count(f"registered models:/{name}/1") == 1
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from trainer.runs import RunRecord
 from trainer.spool.failures import Kind, OutageError, RefusedError, classify, reason
-from trainer.spool.journal import SPOOL, Event, events
+from trainer.spool.journal import SPOOL, Event, events, shown
 from trainer.spool.store import described, experiment_id, open_client
 
 if TYPE_CHECKING:
@@ -303,7 +303,7 @@ class Delivery:
             file.write(json.dumps({"reason": why, "event": event}, ensure_ascii=False) + "\n")
         self.sent.rejected += 1
         what = ", ".join(event.get("values", {})) or event.get("to") or event.get("name") or event["type"]
-        self.say(f"Refused by {described(self.uri)}: {what}: {why} (kept in {path})")
+        self.say(f"Refused by {described(self.uri)}: {what}: {why} (kept in {shown(path)})")
 
     def _file(self, event: Event) -> Path:
         return self.folder / SPOOL / str(event["file"])

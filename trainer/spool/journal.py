@@ -153,14 +153,14 @@ class Journal:
             self._pending.clear()
             if self._full:
                 self._full = False
-                print(f"There is space again: what was recorded is in {self.path}.", file=sys.stderr)
+                print(f"There is space again: what was recorded is in {shown(self.path)}.", file=sys.stderr)
             return
         self._drop(written)
         if not self._full:
             self._full = True
             print(
-                f"The disk is full: {self.path} cannot be written. What is recorded stays in memory until "
-                "there is space; free some before the next checkpoint is due.",
+                f"The disk is full: {shown(self.path)} cannot be written. What is recorded stays in memory "
+                "until there is space; free some before the next checkpoint is due.",
                 file=sys.stderr,
             )
 
@@ -172,6 +172,12 @@ class Journal:
         while rest >= len(self._pending[0]):
             rest -= len(self._pending.pop(0))
         self._torn = rest > 0
+
+
+def shown(path: Path) -> str:
+    """Return a path for messages: below the current directory where it lies there."""
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def _whole(target: Path, write: Any) -> None:

@@ -6,15 +6,14 @@ import contextlib
 import fcntl
 import os
 import random
-import sys
 import threading
 import time
 from pathlib import Path
 
 from trainer.progress import duration
 from trainer.spool.delivery import Delivery, left
-from trainer.spool.failures import Kind, OutageError
-from trainer.spool.journal import SPOOL, Journal
+from trainer.spool.failures import Kind, OutageError, reason
+from trainer.spool.journal import SPOOL, Journal, shown
 from trainer.spool.store import described, is_server
 
 INTERVAL_S = 5.0
@@ -102,10 +101,10 @@ class Sender(threading.Thread):
         self._lock = Lock(folder)
         self._wake = threading.Event()
         self._over = threading.Event()
-        self._hurry = False
+        self._hurry = self._busy = False
         self._backoff = Backoff()
         self._outage: tuple[Kind, float] | None = None
-        self._last_success = time.monotonic()
+        self._last_success = self._last_failure = time.monotonic()
 
     def run(self) -> None:
         """Send until `stop`."""
@@ -120,22 +119,20 @@ class Sender(threading.Thread):
 
         A store that takes nothing at all is waited for `PATIENCE_S` only.
         """
-        begin = shown = time.monotonic()
+        begin = told = time.monotonic()
         self._last_success, self._hurry = begin, True
         self._backoff.reset()
         self._wake.set()
         rest = left(self.folder)
         while rest and self.is_alive():
             now = time.monotonic()
-            patience = now - max(self._last_success, begin) < PATIENCE_S
-            if now - begin > wait_s or (self._outage and not patience):
+            if now - begin > wait_s or (self._useless(begin) and not self._busy):
                 break
-            if now - shown > (3 if is_server(self._delivery.uri) else 15):
-                shown = now
+            if now - told > (3 if is_server(self._delivery.uri) else 15):
+                told = now
+                doing = "waiting for" if self._outage else "sending to"
                 limit = duration(max(wait_s - (now - begin), 0))
-                print(
-                    f"sending to {self._delivery.uri}: {rest} events left, at most {limit}", file=sys.stderr
-                )
+                self._delivery.say(f"{doing} {self._delivery.uri}: {rest} events left, at most {limit}")
             self._over.wait(0.05)
             rest = left(self.folder)
         self._hurry = False
@@ -148,16 +145,27 @@ class Sender(threading.Thread):
         if self.is_alive():
             self.join(timeout=1.0)
 
+    def _useless(self, begin: float) -> bool:
+        """Return whether the store has refused everything for long since `begin`."""
+        waited = time.monotonic() - max(self._last_success, begin)
+        return self._outage is not None and self._last_failure > begin and waited > PATIENCE_S
+
     def _turn(self) -> float:
         """Send a group; returns the seconds to rest."""
         if not self._lock.acquire():
             return 1.0  # another process sends this journal
         used = time.thread_time()
+        self._busy = True
         try:
             moved = self._delivery.step()
         except OutageError as outage:
             self._fail(outage)
             return self._backoff()
+        except Exception as error:  # whatever happens to the run's folder, the training goes on
+            self._fail(OutageError(Kind.AWAY, reason(error)))
+            return self._backoff()
+        finally:
+            self._busy = False
         if moved:
             self._succeed()
         rest = min(REST * (time.thread_time() - used), LONGEST_REST_S)
@@ -177,11 +185,13 @@ class Sender(threading.Thread):
         self._wake.clear()
 
     def _fail(self, outage: OutageError) -> None:
+        self._last_failure = time.monotonic()
         began = self._outage[1] if self._outage else time.monotonic()
         if self._outage is None or self._outage[0] is not outage.kind:
             self._delivery.say(
                 f"{trouble(outage, self._delivery.uri)} Training goes on; what it records is kept in "
-                f"{self.folder / SPOOL} and sent as soon as possible, or by `trainer sync {self.folder}`."
+                f"{shown(self.folder / SPOOL)} and sent as soon as possible, or by "
+                f"`trainer sync {shown(self.folder)}`."
             )
         self._outage = (outage.kind, began)
 
