@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from trainer.configs import UsageError
 
 PACKAGE = "penumbra-denoise"
 QUIET = {
@@ -29,6 +32,12 @@ QUIET = {
 
 FORWARDED = ("MLFLOW_", "AWS_", "PENUMBRA_", "OMP_")
 """Beginnings of the variables that the processes of a job get from the submitting shell."""
+
+LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Where this is 0 Ray keeps to the loopback interface, on every system; read when it is imported."""
+
+CONNECT_S = 10.0
+"""Seconds in which the address of a cluster has to answer."""
 
 OBJECT_STORE = 200 * 1024**2
 """Bytes of shared memory of a Ray that is started here; checkpoints of a restart pass through it."""
@@ -73,6 +82,10 @@ def connected(cluster: Cluster) -> Iterator[Any]:
     need_ray()
     os.environ.update({key: value for key, value in QUIET.items() if key not in os.environ})
     logging.getLogger("ray").setLevel(logging.ERROR)
+    if cluster.address is None:
+        os.environ[LOOPBACK] = "0"
+    else:
+        _check_address(cluster.address)
     import ray
 
     begin = _start if cluster.address is None else _reach
@@ -99,11 +112,46 @@ def _start(ray: Any, cluster: Cluster) -> None:
             logging_level=logging.ERROR,
             configure_logging=True,
             object_store_memory=OBJECT_STORE,
-            _node_ip_address="127.0.0.1",  # its servers then listen on the loopback interface alone
         )
     except Exception as error:  # Ray raises the bare class where its processes do not come up
         reason = str(error).strip().splitlines()[0][:200]
         raise OSError(f"Ray does not start on this machine, perhaps for want of memory: {reason}") from error
+
+
+def _check_address(address: str) -> None:
+    """Find out at once whether something listens at an address; Ray itself would try for minutes.
+
+    Raises:
+        UsageError: It is no address.
+        OSError: Nothing listens there.
+    """
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if address == "auto":
+        return
+    if not colon or not port.isdigit() or not 0 < int(port) < 65536 or "/" in host:
+        raise UsageError(f"--address {address}: expected ray://HOST:10001, HOST:6379 or auto")
+    try:
+        with socket.create_connection((host, int(port)), timeout=CONNECT_S) as found:
+            loopback = found.getpeername()[0].startswith("127.")
+    except OSError as error:
+        raise OSError(f"--address {address}: nothing can be reached there ({error})") from None
+    if loopback and not address.startswith("ray://"):
+        # Ray replaces a loopback address by the machine's own, at which a cluster that is kept to this
+        # machine does not listen.
+        try:
+            socket.create_connection((_own_address(), int(port)), 2).close()
+        except OSError:
+            os.environ[LOOPBACK] = "0"
+
+
+def _own_address() -> str:
+    """Return this machine's address in its network, as Ray finds it; nothing is sent for that."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("8.8.8.8", 53))
+        except OSError:
+            return "127.0.0.1"
+        return str(probe.getsockname()[0])
 
 
 def _reach(ray: Any, cluster: Cluster) -> None:

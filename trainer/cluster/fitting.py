@@ -95,6 +95,8 @@ class _Head:
     def train(self, job: Job, board: Any) -> None:
         """Run the ranks, and restart them where one is lost."""
         enter(tempfile.mkdtemp(prefix="penumbra-head-"), job.environment)
+        workers = f"{job.group.workers} worker" + ("s" if job.group.workers > 1 else "")
+        board.write.remote("stderr", f"starting {workers} ({job.launch})\n")
         import ray.train
         from ray.train.torch import TorchTrainer
 
@@ -153,7 +155,12 @@ def _reasons(error: Any) -> str:
 
 def _reason(error: BaseException) -> str:
     """Return a failure in one line."""
-    if type(error).__name__ in ("RayActorError", "ActorDiedError", "ActorUnavailableError"):
+    if type(error).__name__ in (
+        "RayActorError",
+        "ActorDiedError",
+        "ActorUnavailableError",
+        "WorkerHealthCheckFailedError",
+    ):
         return "its process died (killed, out of memory, or its node went away)"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     words = next((line for line in reversed(lines) if "Error" in line or "Exception" in line), "")

@@ -35,10 +35,6 @@ class Range:
     kind: str
     values: tuple[Any, ...]
 
-    def tried(self) -> tuple[Any, ...]:
-        """Return values whose types stand for all of them."""
-        return self.values
-
     def domain(self) -> Any:
         """Return what Ray Tune draws from."""
         from ray import tune
@@ -125,9 +121,16 @@ def check_space(space: dict[str, Range], arguments: Sequence[str], path: Path) -
     from trainer.cluster.checked import parsed
 
     resolved = configs.resolve_arguments(list(arguments))
-    for key, entry in space.items():
-        for value in entry.tried():
-            try:
-                parsed([*resolved, *options({key: value})])
-            except UsageError as error:
-                raise UsageError(f"{path}, {key}: {value}: {error}") from None
+    rows = max(len(entry.values) for entry in space.values())
+    try:
+        for row in range(rows):  # a few at once, since each takes half a second
+            values = {key: entry.values[row % len(entry.values)] for key, entry in space.items()}
+            parsed([*resolved, *options(values)])
+    except UsageError:
+        for key, entry in space.items():
+            for value in entry.values:
+                try:
+                    parsed([*resolved, *options({key: value})])
+                except UsageError as error:
+                    raise UsageError(f"{path}, {key}: {value}: {error}") from None
+        raise

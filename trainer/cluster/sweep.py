@@ -9,7 +9,11 @@ Pareto front is made of trained trials only, and `--no-early-stop` trains all.
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
+import threading
+import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +22,7 @@ from trainer.cluster.board import Board, follow, sending
 from trainer.cluster.checked import Training
 from trainer.cluster.engine import Cluster, connected, enter, forwarded
 from trainer.cluster.fitting import Group, resources
-from trainer.cluster.outcome import FAILED, FINISHED, STOPPED, Trial, ranked, table, write_results
+from trainer.cluster.outcome import FAILED, FINISHED, RUNNING, STOPPED, Trial, ranked, table, write_results
 from trainer.cluster.space import Range
 from trainer.cluster.trials import Sweep, run_trial
 
@@ -99,7 +103,7 @@ def run_search(search: Search, results: Path, address: str | None, folder: Path,
     group = search.group
     with connected(Cluster(address, group.workers * group.cpus, group.workers * group.gpus)) as ray:
         board = ray.remote(num_cpus=0)(Board).remote()
-        head = ray.remote(num_cpus=0, max_concurrency=2)(_Searcher).remote()
+        head = ray.remote(num_cpus=0)(_Searcher).remote()
         call = head.run.remote(search, str(results), str(folder), forwarded(address), resume, board)
         try:
             code, message = follow(ray, board, call)
@@ -140,24 +144,36 @@ def _conduct(
     sweep = Sweep(
         results.name, training, group, folder, environment, search.metric, search.mode, parent.run_id
     )
-    grid = _tuner(search, sweep, results, resume, board).fit()
+    threading.Thread(target=_interrupt, args=(board,), daemon=True).start()
+    grid = _tuner(search, sweep, results, resume).fit()
     trials = ranked([_trial(result, search) for result in grid], search.mode)
     parent.settle(trials)
     written = write_results(results, trials, search.metric, search.mode)
     print(table(trials, search.metric), flush=True)
     best = next((trial for trial in trials if trial.best), None)
     parent.end(trials, written)
+    if any(trial.state == RUNNING for trial in trials):
+        print(f"next: trainer tune --resume {_shown(results)}", flush=True)
     print(f"results: {results} ({', '.join(path.name for path in written)})", flush=True)
     if (results / "best.yaml").is_file() and best is not None:
         print(f"next: trainer fit --config {_shown(results / 'best.yaml')}", flush=True)
     return 0 if best is not None else 1
 
 
+def _interrupt(board: Any) -> None:
+    """Interrupt Ray Tune as Ctrl-C does when the submitter asks for it; it then keeps its state."""
+    import ray
+
+    while not ray.get(board.cancelled.remote()):
+        time.sleep(1.0)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
 def _shown(path: Path) -> str:
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
-def _tuner(search: Search, sweep: Sweep, results: Path, resume: bool, board: Any) -> Any:
+def _tuner(search: Search, sweep: Sweep, results: Path, resume: bool) -> Any:
     from ray import tune
     from ray.tune.search.optuna import OptunaSearch
 
@@ -266,7 +282,7 @@ def _trial(result: Any, search: Search) -> Trial:
             cost=float(numbers["cost"]),
             epoch=int(numbers["epoch"]),
             run=str(numbers["run"]),
-            state=_state(int(numbers["epoch"]), search),
+            state=_state(int(numbers["epoch"]), search) if numbers.get("done") else RUNNING,
         )
     if result.error is not None:
         return replace(trial, state=FAILED)

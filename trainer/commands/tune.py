@@ -111,7 +111,6 @@ def _search(args: argparse.Namespace) -> Search:
     path = find_space(args.space)
     space = read_space(path)
     training = check_training(args.rest)
-    check_space(space, args.rest, path)
     epochs = _epochs(parsed(resolve_arguments(args.rest)).trainer)
     grace = args.grace or max(1, epochs // 4)
     trials = 20 if args.trials is None else args.trials
@@ -119,6 +118,7 @@ def _search(args: argparse.Namespace) -> Search:
         if value < 1 or (high is not None and value > high):
             most = f" to {high}, the epochs of a trial" if high else " or more"
             raise UsageError(f"{name} {value}: expected 1{most}")
+    check_space(space, args.rest, path)
     return Search(
         training, space, trials,
         Group(args.workers, args.cpus_per_worker, args.gpus_per_worker, args.max_failures),

@@ -17,7 +17,7 @@ def cluster_cache(tmp_path_factory):
 def address(tmp_path_factory, cluster_cache):
     """Address of two nodes whose processes share the prepared samples."""
     place = Workplace(tmp_path_factory.mktemp("nodes"), cluster_cache)
-    process = subprocess.Popen(
+    process = subprocess.Popen(  # its input ends with this process too
         [sys.executable, "-m", "tests.trainer.cluster.two_nodes"], env=place.environment,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip

@@ -14,7 +14,8 @@ pytestmark = pytest.mark.slow
 
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "2", "--trainer.limit_train_batches", "6",
-    "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "1", "--data.init_args.train_patches", "80",
+    "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "1",
+    "--data.init_args.train_patches", "80",
     "--config", "callbacks.yaml",
 )  # fmt: skip
 CALLBACKS = """

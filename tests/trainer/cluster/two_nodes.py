@@ -4,6 +4,7 @@ import os
 import sys
 
 os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_memory_monitor_refresh_ms": "0"}
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # keep to the loopback interface
 
 from ray.cluster_utils import Cluster
 

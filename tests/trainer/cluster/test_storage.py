@@ -1,0 +1,108 @@
+"""A run in a shared folder or an object store."""
+
+import json
+import os
+import uuid
+
+import pytest
+import torch
+
+from trainer.cluster.restoring import kept_files, step_of, unpack
+from trainer.cluster.storage import fetch_checkpoint, fetch_run, send_run, storage_url
+from trainer.runs import Launch, RunRecord, begin_launch, find_checkpoint
+
+
+def make_run(root, step, launch="one"):
+    folder = root / "exp" / "20260101-000000"
+    RunRecord("exp", folder.name, "sqlite:///x.db", "id").save(folder)
+    begin_launch(folder, Launch(launch))
+    save(folder, step)
+    return folder
+
+
+def save(folder, step):
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    partial = folder / "checkpoints" / "partial"
+    torch.save({"global_step": step}, partial)
+    os.replace(partial, folder / "checkpoints" / "last.ckpt")
+
+
+@pytest.fixture(params=["folder", "memory"])
+def storage(request, tmp_path):
+    if request.param == "folder":
+        return str(tmp_path / "shared")
+    return f"memory://{uuid.uuid4().hex}/runs"
+
+
+def test_run_is_fetched_where_another_node_has_none(tmp_path, storage):
+    folder = make_run(tmp_path / "here", 4)
+    send_run(folder, storage_url(storage), {})
+    fetched = fetch_run(storage, "one", tmp_path / "there")
+    assert fetched == tmp_path / "there" / "exp" / folder.name
+    assert RunRecord.load(fetched) == RunRecord.load(folder)
+    assert step_of(fetched) == 4
+    assert fetch_run(storage, "another", tmp_path / "there") is None
+
+
+def test_newest_checkpoint_wins_on_both_ways(tmp_path, storage):
+    folder, sent = make_run(tmp_path / "here", 4), {}
+    send_run(folder, storage_url(storage), sent)
+    save(folder, 6)
+    send_run(folder, storage_url(storage), sent, everything=False)
+    assert fetch_run(storage, "one", tmp_path / "there", newer_than=6) is None
+    assert step_of(fetch_run(storage, "one", tmp_path / "there", newer_than=4)) == 6
+
+
+def test_only_what_changed_is_sent(tmp_path, storage, monkeypatch):
+    folder, sent = make_run(tmp_path / "here", 4), {}
+    send_run(folder, storage_url(storage), sent)
+    monkeypatch.setattr("trainer.cluster.storage.send", None)  # any call would fail
+    send_run(folder, storage_url(storage), sent)
+
+
+def test_checkpoint_at_a_url_brings_its_run(tmp_path, storage, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = make_run(tmp_path / "here", 4)
+    send_run(folder, storage_url(storage), {})
+    url = f"{storage_url(storage)}/exp/{folder.name}/checkpoints/last.ckpt"
+    found = find_checkpoint(url, tmp_path / "there", "exp")
+    assert found == tmp_path / "there" / "exp" / folder.name / "checkpoints" / "last.ckpt"
+    assert RunRecord.load(found.parent.parent).run_id == "id"
+    save(found.parent.parent, 8)
+    assert step_of(fetch_checkpoint(url, tmp_path / "there").parent.parent) == 8
+
+
+def test_lone_checkpoint_at_a_url_goes_into_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("PENUMBRA_CACHE", str(tmp_path / "cache"))
+    torch.save({"global_step": 1}, tmp_path / "model.ckpt")
+    found = fetch_checkpoint((tmp_path / "model.ckpt").as_uri(), tmp_path / "runs")
+    assert found.is_relative_to(tmp_path / "cache")
+    assert found.read_bytes() == (tmp_path / "model.ckpt").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["../../evil", "/etc/x", "a/../../b"])
+def test_storage_cannot_name_files_outside_of_the_run(tmp_path, name):
+    folder = make_run(tmp_path / "here", 4)
+    shared = tmp_path / "shared"
+    send_run(folder, storage_url(str(shared)), {})
+    (shared / "exp" / folder.name / "mirror.json").write_text(json.dumps({"files": [name]}))
+    with pytest.raises(ValueError, match="outside"):
+        fetch_run(str(shared), "one", tmp_path / "there")
+
+
+def test_packed_run_is_whole_where_it_is_unpacked(tmp_path):
+    folder = make_run(tmp_path / "here", 4)
+    files = {name: path.read_bytes() for name, path in kept_files(folder).items()}
+    unpack(tmp_path / "there", files)
+    assert {n: p.read_bytes() for n, p in kept_files(tmp_path / "there").items()} == files
+
+
+def test_unreachable_storage_is_told_once_and_training_goes_on(tmp_path, capsys):
+    from trainer.callbacks import MirrorRun
+
+    (tmp_path / "file").write_text("")
+    mirror = MirrorRun(str(tmp_path / "file" / "below"))
+    mirror._folder = make_run(tmp_path / "here", 4)
+    assert not mirror._pass(everything=True)
+    assert not mirror._pass(everything=True)
+    assert capsys.readouterr().err.count("not mirrored") == 1
