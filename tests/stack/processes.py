@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pwd
+import shutil
 import signal
 import socket
 import subprocess
@@ -75,9 +76,12 @@ class Server:
     def launch(self) -> None:
         """Start the server without waiting for it."""
         assert not self.running, "the server runs already"
+        # If the process that started it is killed, it ends too. PostgreSQL waits for its clients on SIGTERM.
+        number = "INT" if Path(self.command[0]).name == "postgres" else "TERM"
+        bound = ["setpriv", "--pdeathsig", number] if shutil.which("setpriv") else []
         with self.log.open("ab") as output:
             self.process = subprocess.Popen(
-                self.command, cwd=self.folder, env=self.environment, start_new_session=True,
+                [*bound, *self.command], cwd=self.folder, env=self.environment, start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=output, stderr=output, user=self.user,
                 group=self.user and _group(self.user), extra_groups=[] if self.user else None,
             )  # fmt: skip

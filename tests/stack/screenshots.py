@@ -10,7 +10,9 @@ import argparse
 import asyncio
 import base64
 import io
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -30,6 +32,11 @@ SIZE = (1440, 900)
 COLORS = 128
 """Colours of a picture: pages have few, and files stay small."""
 
+COLUMNS = [
+    "metrics.`val/psnr_wskp`", "metrics.`val/ssim_wskp`", "params.`model.init_args.loss.class_path`",
+    "params.`model.init_args.optimizer.init_args.lr`",
+]  # fmt: skip
+CHARTS = "val/(psnr|ssim|smape)_wskp$"
 RUNS = {"loss: SMAPE, lr 0.004": (), "lr 0.016": ("--model.init_args.optimizer.init_args.lr", "0.016"),
         "L1": ("--model.init_args.loss", "trainer.losses.L1")}  # fmt: skip
 OPTIONS = (
@@ -74,19 +81,39 @@ class Browser:
             await asyncio.sleep(0.5)
         await asyncio.sleep(4)
 
-    async def click(self, text: str) -> None:
-        """Click on the last element whose own text is the given one."""
-        found = await self.run(
-            "(() => { const all = [...document.querySelectorAll('*')].filter(e => e.innerText?.trim() === "
-            f"{text!r}); all.at(-1)?.click(); return all.length; }})()"
+    async def click(self, selector: str, text: str) -> None:
+        """Press and release the mouse on the first element of a CSS selector that begins with a text."""
+        box = await self.run(
+            f"(() => {{ const found = [...document.querySelectorAll({selector!r})].find(e => (e.innerText || "
+            f"e.placeholder || '').trim().startsWith({text!r})); "
+            "const box = found?.getBoundingClientRect(); "
+            "return box && [box.x + Math.min(box.width / 2, 60), box.y + box.height / 2]; })()"
         )
-        if not found:
-            raise LookupError(f"nothing on the page is called {text!r}")
+        if not box:
+            raise LookupError(f"the page has no {selector} {text!r}")
+        for kind in ("mousePressed", "mouseReleased"):
+            await self.call(
+                "Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1
+            )
         await asyncio.sleep(3)
 
-    async def take(self, path: Path) -> None:
-        """Write what is seen as a PNG of few colours."""
-        shot = await self.call("Page.captureScreenshot", format="png")
+    async def write(self, text: str) -> None:
+        """Type a text into the field that was clicked."""
+        await self.call("Input.insertText", text=text)
+
+    async def wait_for(self, selector: str, count: int, wait_s: float = 90.0) -> None:
+        """Wait until so many elements of a CSS selector are there."""
+        deadline = time.monotonic() + wait_s
+        while await self.run(f"document.querySelectorAll({selector!r}).length") < count:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the page has fewer than {count} {selector}")
+            await asyncio.sleep(0.5)
+        await asyncio.sleep(4)
+
+    async def take(self, path: Path, height: int = SIZE[1]) -> None:
+        """Write the upper part of what is seen as a PNG of few colours."""
+        clip = {"x": 0, "y": 0, "width": SIZE[0], "height": height, "scale": 1}
+        shot = await self.call("Page.captureScreenshot", format="png", clip=clip)
         picture = Image.open(io.BytesIO(base64.b64decode(shot["data"]))).convert("RGB")
         picture.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
@@ -142,6 +169,24 @@ def train(folder: Path, environment: dict[str, str]) -> None:
         )  # fmt: skip
 
 
+def preferences(experiment: str) -> str:
+    """Return a script that sets what MLflow remembers of a person's choices."""
+    page = f'MLflowLocalStorage-1.1-ExperimentPage-["{experiment}"]-ReactComponentState'
+    state = {"orderByKey": "attributes.start_time", "orderByAsc": False, "selectedColumns": COLUMNS}
+    chosen = {
+        "mlflow.workflowType_v1": '"machine_learning"',
+        "mlflow.assistant.fab.autoOpenedOnFirstLoad_v1": "true",
+        "mlflow.assistant.panelOpen_v1": "false",
+        page: json.dumps(state),
+    }
+    return f"Object.entries({json.dumps(chosen)}).forEach(([key, value]) => localStorage.setItem(key, value))"
+
+
+def _step(path: str) -> tuple[int, str]:
+    found = re.search(r"\+step\+(\d+)", path)
+    return (int(found[1]) if found else -1, path)
+
+
 async def take_all(uri: str, account: tuple[str, str], output: Path) -> None:
     """Take the pictures of the runs on a server."""
     from mlflow.tracking import MlflowClient
@@ -149,16 +194,29 @@ async def take_all(uri: str, account: tuple[str, str], output: Path) -> None:
     client = MlflowClient(uri, uri)
     experiment = client.get_experiment_by_name("wskp_bmfr").experiment_id
     runs = client.search_runs([experiment])
-    first = runs[-1].info.run_id
+    first, name = runs[-1].info.run_id, runs[-1].info.run_name
+    pictures = [entry.path for entry in client.list_artifacts(first, "images") if entry.path.endswith(".png")]
+    base = f"{uri}/#/experiments/{experiment}/runs"
 
     async def visit(browser: Browser) -> None:
-        await browser.show(f"{uri}/#/experiments/{experiment}/runs", runs[0].info.run_name)
-        await browser.take(output / "runs.png")
-        await browser.show(f"{uri}/#/experiments/{experiment}/runs?compareRunsMode=CHART", "psnr")
+        await browser.call("Page.enable")
+        await browser.call("Page.addScriptToEvaluateOnNewDocument", source=preferences(experiment))
+        await browser.show(base, name)
+        await browser.take(output / "runs.png", height=440)
+        await browser.show(f"{base}?compareRunsMode=CHART", "throughput")
+        await browser.run("document.head.append(Object.assign(document.createElement('style'), "
+                          "{textContent: '.modebar {display: none}'}))")  # fmt: skip
+        await browser.click("input", "Search metric charts")
+        await browser.write(CHARTS)
+        await asyncio.sleep(3)
+        await browser.wait_for(".js-plotly-plot", 3)
         await browser.take(output / "charts.png")
         await browser.show(f"{uri}/#/models/wskp", "champion")
-        await browser.take(output / "registry.png")
-        await browser.show(f"{uri}/#/experiments/{experiment}/runs/{first}/artifacts", "export")
+        await browser.take(output / "registry.png", height=520)
+        await browser.show(f"{base}/{first}/artifacts", "images")
+        await browser.click("span, div", "images")
+        await browser.click("span, div", Path(max(pictures, key=_step)).name)
+        await asyncio.sleep(4)
         await browser.take(output / "artifacts.png")
 
     await with_browser(visit, account)

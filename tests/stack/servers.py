@@ -178,6 +178,10 @@ class Stack:
 
     def _make_database(self) -> Server:
         """Do what the image's entry point does in an empty volume: cluster, role, databases, scripts."""
+        if shutil.which("initdb", path=self._programs) is None:
+            raise FileNotFoundError(
+                "PostgreSQL's programs (initdb) are missing; Debian: apt install postgresql"
+            )
         # The test's folder may be closed to the ordinary user that PostgreSQL insists on.
         self._database_folder = folder = Path(tempfile.mkdtemp(prefix="penumbra-database-"))
         service = self.services["database"]
