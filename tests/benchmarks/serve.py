@@ -92,8 +92,8 @@ def _server(folder: Path) -> Iterator[_Served]:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     log = folder / "log"
-    command = [sys.executable, "-m", "trainer", "serve", "--model", str(folder / "wskp.ckpt"), "--port", str(port),
-               "--queue", "32", "--quiet"]  # fmt: skip
+    options = ["--model", str(folder / "wskp.ckpt"), "--port", str(port), "--queue", "32", "--quiet"]
+    command = [sys.executable, "-m", "trainer", "serve", *options]
     with log.open("wb") as sink:
         process = subprocess.Popen(command, stdout=sink, stderr=sink)
     served = _Served(process, port)
@@ -250,6 +250,7 @@ def _send_malformed(port: int, folder: Path, count: int) -> dict[str, int]:
             request, torn = _wrong(mutated(choice.choice(originals), choice), choice)
             # Most that are torn end; the others leave the server waiting.
             status = _status(port, request, torn and choice.random() < 0.95)
+            status = "dead" if status == "closed" and not torn else status
             with lock:
                 statuses[status] += 1
 
@@ -288,8 +289,8 @@ def _wrong_http(body: bytes, choice: random.Random) -> bytes:
 def _status(port: int, request: bytes, ends: bool) -> str:
     """Send bytes, end the sending side or leave it open, and return the status of the answer.
 
-    `closed` where the server closed without one, as it may where a client stops sending in the middle of its
-    body; `dead` where it cannot be reached or does not answer.
+    `closed` where the server closed without one, as it may where a client stops in the middle of its request;
+    `dead` where it cannot be reached or does not answer.
     """
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=60) as connection:

@@ -100,8 +100,8 @@ def test_mlflow_models_serve_answers_with_the_picture_of_the_pyfunc(trained, tmp
     from trainer.export.register import using_store
 
     port = free_port()
-    command = [sys.executable, "-m", "mlflow", "models", "serve", "-m", "models:/wskp/1", "--env-manager", "local",
-               "--host", "127.0.0.1", "--port", str(port)]  # fmt: skip
+    options = ["-m", "models:/wskp/1", "--env-manager", "local", "--host", "127.0.0.1", "--port", str(port)]
+    command = [sys.executable, "-m", "mlflow", "models", "serve", *options]
     shown = frame(20, 24)
     color, albedo = shown.buffers["color"], shown.buffers["albedo"]
     arrays = {"irradiance": color / albedo, "albedo": albedo, "normal": shown.buffers["normal"],

@@ -29,7 +29,7 @@ _BINARY = {"type": "string", "format": "binary"}
 class Health(BaseModel):
     """Whether the server takes requests."""
 
-    status: Literal["ok", "ending"]
+    status: Literal["ok", "ending", "failed"]
     model: str
 
 
@@ -76,9 +76,9 @@ def _add_pages(app: FastAPI, service: Service) -> None:
 
     @app.get("/health", summary="Whether the server takes requests", responses=_not_ok(503, Health))
     async def health() -> Response:
-        status = "ending" if service.draining else "ok"
+        status = "ending" if service.draining else "ok" if service.batcher.alive else "failed"
         content = {"status": status, "model": service.loaded.source.reference}
-        return JSONResponse(content, 503 if service.draining else 200)
+        return JSONResponse(content, 200 if status == "ok" else 503)
 
     @app.get(
         "/metrics",
@@ -156,7 +156,10 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 def _not_ok(status: int, model: type[BaseModel]) -> dict[int | str, dict[str, Any]]:
-    return {200: {"model": model}, status: {"model": model, "description": "The server is ending."}}
+    return {
+        200: {"model": model},
+        status: {"model": model, "description": "The server is ending, or its model's thread has failed."},
+    }
 
 
 def _unauthorized(service: Service) -> dict[int | str, dict[str, Any]]:

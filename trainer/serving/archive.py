@@ -76,6 +76,8 @@ def _name(info: zipfile.ZipInfo) -> str:
         raise ValueError(f"the ZIP file holds {shown}, which leads out of its folder; expected plain names")
     if info.flag_bits & _ENCRYPTED:
         raise ValueError(f"{shown} in the ZIP file is encrypted; expected files that anyone can read")
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{shown} in the ZIP file is packed in an unusual way; expected stored or deflated")
     mode = info.external_attr >> 16
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         raise ValueError(f"{shown} in the ZIP file is no plain file; expected EXR files")

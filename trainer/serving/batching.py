@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +26,9 @@ from trainer.serving.limits import Over, Ticket
 CPU_PIXELS = 1 << 16
 """Pixels of a batch beyond which a CPU gains nothing. With WSKP on two cores a tile in a batch of four took
 0.45 of the time of a single one at 32x32, 0.74 at 64x64, 0.88 at 128x128, 1.0 at 256x256, 1.3 at 512x512."""
+
+_LOOK = 5.0
+"""Seconds after which who waits for a tile looks whether the model's thread is still there."""
 
 Told = Callable[[int, float], None]
 """Told the tiles of a batch and their megapixels."""
@@ -48,7 +51,7 @@ class Batching:
     threads: int | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # the same tile is the same object: tensors have no truth value
 class _Tile:
     call: Call
     buffers: Mapping[str, Tensor]
@@ -91,6 +94,11 @@ class Batcher:
         self._thread = threading.Thread(target=self._work, name="model", daemon=True)
         self._thread.start()
 
+    @property
+    def alive(self) -> bool:
+        """Whether the model's thread runs."""
+        return self._thread.is_alive()
+
     def run(self, ticket: Ticket, call: Call, buffers: Mapping[str, Tensor]) -> Any:
         """Return `call(buffers)`, computed in the model's thread, perhaps beside tiles of other requests.
 
@@ -104,6 +112,9 @@ class Batcher:
                 raise Over
             self._waiting.append(tile)
             self._changed.notify()
+        while not wait([tile.result], _LOOK).done:
+            if not self.alive:
+                raise Over
         return tile.result.result()
 
     def close(self) -> None:
@@ -116,10 +127,14 @@ class Batcher:
     def _work(self) -> None:
         if self.batching.threads is not None:
             torch.set_num_threads(self.batching.threads)
-        while tiles := self._next():
-            self._run(tiles)
-        for tile in self._waiting:
-            tile.result.set_exception(Over())
+        try:
+            while tiles := self._next():
+                self._run(tiles)
+        finally:
+            with self._changed:
+                self._closed = True
+                for tile in self._waiting:
+                    tile.result.set_exception(Over())
 
     def _next(self) -> list[_Tile]:
         """Wait for tiles and return those of the next batch; none when it is time to end."""

@@ -1,10 +1,10 @@
 """The process in which uploaded files are decoded: `python -m trainer.serving.reader LIMITS`.
 
-Decoders are compiled code that trusts what a header says. Of 20,000 mutated EXR files of 48x40 pixels one
+Decoders are compiled code that trusts what a header says. Of 19,000 mutated EXR files of 48x40 pixels one
 made OpenEXR 3.5 take all memory of a machine with 24 GiB, and another took 1.6 GB and four seconds. So
-decoding has a process of its own, whose memory is limited and which may be killed at any time. It reads a line
-of JSON for each request from its standard input and answers on its standard output (`wire`); nothing but NumPy
-and OpenEXR is loaded.
+decoding has a process of its own, whose memory is limited and which may be killed at any time. It reads a
+line of JSON for each request from its standard input and answers on its standard output (`wire`); nothing but
+NumPy and OpenEXR is loaded.
 """
 
 from __future__ import annotations

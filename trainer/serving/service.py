@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import hmac
 import itertools
 import logging
@@ -30,6 +31,7 @@ from trainer.serving.work import Done, Wish, Workshop, remove
 READERS = 2
 _LOG = logging.getLogger("penumbra.serve")
 _GONE = 499
+_TRIM_SECONDS = 1.0
 
 
 class Service:
@@ -53,6 +55,8 @@ class Service:
         self.sending = self.admitted = 0
         self.draining = False
         self.seconds = 1.0
+        self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        self._trimmed = 0.0
         self.readers = Readers(READERS, limits)
         self.metrics = Metrics(
             loaded, lambda: max(0, self.admitted - self.active), lambda: self.readers.deaths
@@ -169,6 +173,7 @@ class Service:
 
         def free() -> None:
             self.admitted -= 1
+            self._give_back()
             if not ended:
                 remove(folder)
 
@@ -204,6 +209,12 @@ class Service:
             done = self.workshop.work(folder, name, wish, ticket)
             self.metrics.megapixels.inc(done.pixels / 1e6)
             return done
+
+    def _give_back(self) -> None:
+        """Return freed memory to the system: glibc keeps that of each thread, and more with every size."""
+        if self._trim is not None and time.monotonic() - self._trimmed > _TRIM_SECONDS:
+            self._trimmed = time.monotonic()
+            self._trim(0)
 
 
 async def _gone(request: Request) -> None:

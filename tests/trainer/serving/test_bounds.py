@@ -226,10 +226,9 @@ def test_a_reader_that_hangs_is_replaced(tmp_path):
 
 def test_the_budget_lets_one_wait_until_another_is_done_or_its_time_is_up():
     budget = Budget(100)
-    with budget.hold(70, Ticket(time.monotonic() + 60)):
-        with budget.hold(30, Ticket(time.monotonic() + 60)), pytest.raises(Over):
-            with budget.hold(1, Ticket(time.monotonic() + 0.2)):
-                pass
+    ticket, late = Ticket(time.monotonic() + 60), budget.hold(1, Ticket(time.monotonic() + 0.2))
+    with budget.hold(70, ticket), budget.hold(30, ticket), pytest.raises(Over):
+        late.__enter__()
     with budget.hold(10**9, Ticket(time.monotonic() + 60)):
         assert budget.held == 100
     assert budget.held == 0
@@ -294,6 +293,42 @@ def test_tiles_of_other_shapes_or_beyond_the_memory_are_batches_of_their_own():
         gate.set()
     batcher.close()
     assert sorted(sizes[1:]) == [(1, 3, 16, 16), (1, 3, 20, 20), (2, 3, 16, 16)]
+
+
+def test_a_tile_is_taken_from_behind_others_of_another_shape():
+    sizes = []
+    entered, gate = threading.Event(), threading.Event()
+
+    def net(buffers):
+        sizes.append(tuple(buffers["color"].shape))
+        entered.set()
+        gate.wait(60)
+        return Denoised(buffers["color"])
+
+    batcher = Batcher(Batching(threads=1))
+    ticket, gone = Ticket(time.monotonic() + 60), Ticket(time.monotonic() + 60)
+    with ThreadPoolExecutor(8) as pool:
+        pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, 8, 8)})
+        assert entered.wait(60)
+        for number, size in enumerate((16, 20, 16, 20), 1):
+            pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, size, size)})
+            wait_until(lambda number=number: len(batcher._waiting) == number)
+        dropped = pool.submit(batcher.run, gone, net, {"color": torch.zeros(1, 3, 16, 16)})
+        wait_until(lambda: len(batcher._waiting) == 5)
+        gone.cancel()
+        gate.set()
+        with pytest.raises(Over):
+            dropped.result()
+    assert batcher.alive
+    batcher.close()
+    assert sizes[1:] == [(2, 3, 16, 16), (2, 3, 20, 20)]
+
+
+def test_a_service_whose_model_cannot_run_any_more_is_not_healthy():
+    with Running(Gate()) as service:
+        service.service.batcher.close()
+        answer = service.client.get("/health")
+        assert (answer.status_code, answer.json()["status"]) == (503, "failed")
 
 
 def test_large_tiles_are_not_joined_where_that_gains_nothing():
