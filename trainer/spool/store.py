@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,7 +95,28 @@ def open_client(uri: str) -> MlflowClient:
     quiet_mlflow()
     from mlflow.tracking import MlflowClient
 
+    database = Path(uri.removeprefix("sqlite:///"))
+    if uri.startswith("sqlite:///") and not database.exists():
+        _make_database(database)
     return MlflowClient(tracking_uri=uri, registry_uri=uri)
+
+
+def _make_database(path: Path) -> None:
+    """Make a database beside its name and give it that when it is complete.
+
+    MLflow makes dozens of tables one by one; whoever is killed meanwhile would leave some, with which it
+    never opens the database again.
+    """
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        store = SqlAlchemyStore(f"sqlite:///{partial}", "./mlruns")  # of the experiment "Default", never used
+        store.engine.dispose()
+        with contextlib.suppress(FileExistsError):  # another run was faster
+            os.link(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def experiment_id(client: MlflowClient, uri: str, name: str) -> str:
