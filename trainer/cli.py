@@ -150,10 +150,11 @@ def _run(verb: str, arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog=f"trainer {verb}", description=command.HELP)
     command.add_arguments(parser)
     if getattr(command, "PASSES_ON", False):  # options that it does not know are another command's
-        args, args.rest = parser.parse_known_args(arguments)
+        options, rest = parser.parse_known_args(arguments)
+        options.rest = rest
     else:
-        args = parser.parse_args(arguments)
-    code: int = command.run(args)
+        options = parser.parse_args(arguments)
+    code: int = command.run(options)
     return code
 
 
