@@ -206,7 +206,7 @@ def _converted(image: ExrImage, name: str, channels: list[str], planar: bool) ->
     hidden = image.outside.get(channels[0])
     if hidden is None:
         return array, 0
-    array[hidden] = buffer(name).no_hit
+    np.copyto(array, np.asarray(buffer(name).no_hit, np.float32), where=hidden[..., None])
     return array, int(hidden.sum())
 
 

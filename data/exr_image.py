@@ -31,6 +31,12 @@ than eleven bits for much of a picture's range."""
 MAX_BYTES = 1 << 34
 """Largest image that is read, as float32."""
 
+COPIES = 4
+"""How many times the float32 pixels of the largest window, all channels, reading a file takes in memory."""
+
+SCRATCH = 64 << 20
+"""Bytes that reading a file may take beside that."""
+
 _MODEST_BYTES = 1 << 28
 _MAX_RATIO = 4096
 _LINES = {"NO": 1, "RLE": 1, "ZIPS": 1, "ZIP": 16, "PXR24": 16, "PIZ": 32, "B44": 32, "B44A": 32, "DWAA": 32}

@@ -161,11 +161,11 @@ class Manifest:
             }
             rest = {k: v for k, v in values.items() if k not in ("format", "version", "scenes")}
             manifest: Manifest = _record(Manifest, {**rest, "scenes": scenes})
+            manifest.validate(source)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{source} is incomplete or damaged: {error}; run `trainer ingest` again"
             ) from error
-        manifest.validate(source)
         return manifest
 
     def validate(self, source: str = MANIFEST) -> None:
@@ -218,7 +218,7 @@ def load_manifest(root: str | Path) -> Manifest:
         )
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}; run `trainer ingest` again") from error
     return Manifest.from_json(values, str(path))
 

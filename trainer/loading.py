@@ -10,12 +10,9 @@ MODEL is one of
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
 import re
 import tempfile
-import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,16 +22,20 @@ from typing import Any, Literal
 
 import torch
 
+from data.manifest import file_sha256
 from models.denoiser import Denoiser
-from trainer.building import FORMS, build, class_path_of, find_class
+from trainer.building import FORMS, build, class_path_of, find_class, outlined
 from trainer.configs import UsageError
 from trainer.export.artifact import SUFFIXES, Artifact, load_artifact
 from trainer.export.description import Source
 from trainer.options import options_of, parse
+from trainer.reading import network_of, read_checkpoint
 
 Model = Denoiser | Artifact
 RUNS = Path("runs")
 """Where `trainer fit` keeps its runs and the local store."""
+
+_SPARE = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def _from_path(path: Path, device: str) -> Loaded:
         artifact = load_artifact(path, device)
         return Loaded(artifact, replace(artifact.description.source, reference=str(path)))
     checkpoint = read_checkpoint(path)
-    source = Source(reference=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    source = Source(reference=str(path), sha256=file_sha256(path))
     if "hyper_parameters" in checkpoint:
         denoiser, source = _from_training(checkpoint, path, source)
     elif method := _published_method(checkpoint):
@@ -147,61 +148,61 @@ def _file_of_folder(folder: Path) -> Path:
 
 
 def _is_torchscript(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
-
-
-def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Return the dictionary in a file of `torch.save`, read without running code from it.
-
-    Raises:
-        ValueError: The file is truncated, not a checkpoint, or holds objects that only pickle could restore.
-    """
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Detected pickle protocol", UserWarning)  # it is no checkpoint
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        if zipfile.is_zipfile(path):
-            reason = (
-                "it holds Python objects beside tensors and plain values, which are not loaded for safety"
-            )
-        else:
-            reason = "its content is neither a checkpoint nor an exported model"
-        raise ValueError(f"{path} cannot be loaded: {reason}; expected {FORMS}") from error
-    except PermissionError:
-        raise
-    except (RuntimeError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        first = (str(error).splitlines() or [repr(error)])[0][:160]
-        raise ValueError(f"{path} is truncated or not a checkpoint ({first})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} holds a {type(content).__name__}, expected a checkpoint's dictionary")
-    return content
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith("/constants.pkl") for name in archive.namelist())
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):
+        return False
 
 
 def _from_training(checkpoint: dict[str, Any], path: Path, source: Source) -> tuple[Denoiser, Source]:
-    tree = checkpoint["hyper_parameters"].get("net")
-    if not isinstance(tree, Mapping) or "class_path" not in tree:
-        raise ValueError(f"{path} does not say which network it holds (hyper_parameters.net.class_path)")
-    arguments = dict(tree.get("init_args") or {})
+    class_path, arguments = network_of(checkpoint, path)
+    weights = _weights(checkpoint.get("state_dict", {}), path)
     try:
-        denoiser = build(str(tree["class_path"]), arguments)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {error}") from error
-    weights = {
-        name.removeprefix("net."): value
-        for name, value in checkpoint.get("state_dict", {}).items()
-        if name.startswith("net.")
-    }
+        with outlined(len(weights)):
+            outline = _outline(class_path, arguments)
+        if outline is not None:
+            _fill(outline, weights, path, assign=True)
+            _check_size(outline, weights, path)
+        denoiser = build(class_path, arguments, foreign=True)
+    except (TypeError, AttributeError, ArithmeticError, LookupError, RuntimeError, ValueError) as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     _fill(denoiser, weights, path)
-    return denoiser, replace(source, class_path=str(tree["class_path"]), init_args=arguments)
+    return denoiser, replace(source, class_path=class_path, init_args=arguments)
 
 
-def _fill(denoiser: Denoiser, weights: dict[str, Any], path: Path) -> None:
+def _outline(class_path: str, arguments: dict[str, Any]) -> Denoiser | None:
+    """Return a network without memory; None for one from elsewhere that cannot be without."""
     try:
-        denoiser.load_state_dict(weights)
+        return build(class_path, arguments, foreign=True)
+    except NotImplementedError:
+        if class_path.startswith("models."):
+            raise
+    return None
+
+
+def _weights(state: Any, path: Path) -> dict[str, torch.Tensor]:
+    """Return the weights of the network in the state of a training module."""
+    if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+        raise ValueError(f"{path} is damaged: its state_dict is no mapping of names to tensors")
+    weights = {name.removeprefix("net."): value for name, value in state.items() if name.startswith("net.")}
+    if not all(isinstance(value, torch.Tensor) for value in weights.values()):
+        raise ValueError(f"{path} is damaged: its state_dict holds something else than tensors")
+    return weights
+
+
+def _check_size(outline: Denoiser, weights: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Refuse a network before memory is taken for it, where it takes much more than is stored of it."""
+    storages = [tensor.untyped_storage() for tensor in weights.values()]
+    held = sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+    size = sum(tensor.nbytes for tensor in (*weights.values(), *(b for b in outline.buffers() if b.is_meta)))
+    if size > 4 * held + _SPARE:
+        raise ValueError(f"{path}: the network takes {size >> 20} MiB, far more than is stored of it")
+
+
+def _fill(denoiser: Denoiser, weights: Mapping[str, torch.Tensor], path: Path, assign: bool = False) -> None:
+    try:
+        denoiser.load_state_dict(weights, assign=assign)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines()[1:3]]
         raise ValueError(

@@ -59,10 +59,13 @@ class RunRecord:
         """
         path = folder / RUN_FILE
         try:
-            return cls(**json.loads(path.read_text()))
+            record = cls(**json.loads(path.read_text()))
+            if wrong := [name for name, value in asdict(record).items() if not isinstance(value, str | None)]:
+                raise ValueError(f"{wrong[0]} is no text")
+            return record
         except FileNotFoundError:
             raise ValueError(f"{folder} is not a run folder: it has no {RUN_FILE}") from None
-        except (json.JSONDecodeError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{path} is damaged: {error}") from None
 
 
@@ -203,6 +206,6 @@ def _read(path: Path) -> dict[str, object]:
     """Return what a launch noted; nothing where the file is absent or damaged."""
     try:
         record = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}

@@ -222,7 +222,7 @@ class TrainingCLI(LightningCLI):
         newest = folder / "checkpoints" / "last.ckpt"
         config.ckpt_path = str(newest) if newest.is_file() else None
         logger.resume_from = str(folder)
-        if rank_zero_only.rank == 0:
+        if getattr(rank_zero_only, "rank", 0) == 0:  # Lightning sets the attribute on its function
             place = f"from {newest}" if config.ckpt_path else "from its beginning, it has no checkpoint yet"
             print(f"restarted: the run {folder.name} goes on {place}", file=sys.stderr)
         return True
@@ -327,25 +327,24 @@ def check_checkpoint(path: Path, net: Any, critics: str | None = None) -> None:
         net: The configured network.
         critics: The configured critic, described; empty for a training without; None: does not matter.
     """
-    import pickle
+    from trainer.reading import network_of, plain, read_checkpoint
 
-    import torch
-
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        arguments = checkpoint["hyper_parameters"]
-        saved = arguments["net"]
-    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, OSError) as error:
-        raise ValueError(f"{path} cannot be read as a checkpoint: {str(error).splitlines()[0]}") from None
-    except (KeyError, TypeError):
-        raise ValueError(f"{path} is not a checkpoint of `trainer fit`") from None
-    wanted = net.as_dict()
-    if _described(saved) != _described(wanted):
+    checkpoint = read_checkpoint(path)
+    if "hyper_parameters" not in checkpoint:
+        raise ValueError(f"{path} is not a checkpoint of `trainer fit`")
+    class_path, settings = network_of(checkpoint, path)
+    arguments = plain(
+        {name: checkpoint["hyper_parameters"].get(name) for name in ("critic", "adversarial_weight")}, path
+    )
+    held, wanted = _described({"class_path": class_path, "init_args": settings}), _described(net.as_dict())
+    if held != wanted:
         raise ValueError(
-            f"{path} holds {_described(saved)}, but the configuration asks for {_described(wanted)}; "
+            f"{path} holds {held}, but the configuration asks for {wanted}; "
             "give the configuration that it was trained with"
         )
     critic = arguments.get("critic") if arguments.get("adversarial_weight") else None
+    if critic and not (isinstance(critic, dict) and "class_path" in critic):
+        raise ValueError(f"{path} is damaged: its critic is no mapping with a class_path")
     held = _described(critic) if critic else ""
     if critics is not None and held != critics:
         raise ValueError(

@@ -20,7 +20,8 @@ from tests.models.test_published import authors_afgsa
 from trainer.export import Artifact, Source, export
 from trainer.export.entry import example
 from trainer.export.register import log_and_register, using_store
-from trainer.loading import load_model, model_store, read_checkpoint, resolve
+from trainer.loading import load_model, model_store, resolve
+from trainer.reading import read_checkpoint
 
 ARGUMENTS = {"layers": 2, "width": 6, "kernel_sizes": [3, 5]}
 TREE = {"class_path": "models.WSKP", "init_args": ARGUMENTS}

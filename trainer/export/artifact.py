@@ -1,10 +1,19 @@
-"""Exported artifacts as denoisers: what the contract declares, around ONNX Runtime or TorchScript."""
+"""Exported artifacts as denoisers: what the contract declares, around ONNX Runtime or TorchScript.
+
+Exported files are programs. An ONNX graph computes and does nothing else, but may take any time and memory;
+files beside it are not read. A TorchScript archive holds code that runs when it is loaded and when it is
+called, in PyTorch's own language: code that names functions which open files is refused, yet it should come
+from somebody who is trusted, as a program should. Checkpoints hold no code (`trainer.loading`). Neither
+library is hardened against files made to crash it; `trainer serve` loads the model it is started with only.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 import zipfile
-from collections.abc import Collection, Mapping
+import zlib
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +30,11 @@ from trainer.export.torchscript import EXTRA_FILE
 
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}
 """File suffix of each format."""
+
+_FILES = re.compile(rb"\b(from_file|torch\.save|torch\.load|ops\.(?!prim\b)\w+)\b")
+"""TorchScript code that opens files, or calls operators of other libraries."""
+
+_UNPACKED = 20
 
 
 class Runtime(Protocol):
@@ -120,7 +134,7 @@ class Artifact:
 
 
 class _OnnxRuntime:
-    def __init__(self, source: str | bytes, device: str) -> None:
+    def __init__(self, source: bytes, device: str) -> None:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -159,31 +173,72 @@ def load_artifact(path: Path | str, device: str = "cpu") -> Artifact:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    if zipfile.is_zipfile(path):
+    if is_archive(path):
         return open_torchscript(path.read_bytes(), str(path), device)
-    return open_onnx(str(path), str(path), device)
+    return open_onnx(path.read_bytes(), str(path), device)
 
 
-def open_onnx(source: str | bytes, name: str, device: str = "cpu") -> Artifact:
-    """Open an ONNX file, or its content; `name` is for messages. Raises as `load_artifact` does."""
+def is_archive(path: Path) -> bool:
+    """Return whether a file is a ZIP archive, whatever state it is in."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # its end is damaged
+        return True
+
+
+def open_onnx(content: bytes, name: str, device: str = "cpu") -> Artifact:
+    """Open the content of an ONNX file; `name` is for messages. Raises as `load_artifact` does."""
     from onnxruntime.capi import onnxruntime_pybind11_state as states
+
+    description = _described(_onnx_metadata(content, name), name)
 
     broken = (states.InvalidProtobuf, states.InvalidGraph, states.Fail, states.InvalidArgument,
               states.NoSuchFile, states.NotImplemented)  # fmt: skip
     try:
-        runtime = _OnnxRuntime(source, device)
+        runtime = _OnnxRuntime(content, device)
     except broken as error:
         first = str(error).splitlines()[0][:200]
         raise ValueError(
             f"{name} is not an ONNX or TorchScript file, or is damaged ({first}); export the model again"
         ) from error
-    text = runtime.session.get_modelmeta().custom_metadata_map.get(KEY)
-    return Artifact(_described(text, name), runtime, name)
+    return Artifact(description, runtime, name)
+
+
+def _onnx_metadata(content: bytes, name: str) -> str | None:
+    """Return the description in an ONNX file; refuses weights in other files and foreign operators."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        model = onnx.load_model_from_string(content)
+    except (DecodeError, ValueError) as error:
+        raise ValueError(
+            f"{name} is not an ONNX or TorchScript file, or is damaged ({error}); export the model again"
+        ) from error
+    for message in _messages(model):
+        if isinstance(message, onnx.TensorProto) and (message.data_location or message.external_data):
+            raise ValueError(f"{name} has weights in other files, which are not read; export the model again")
+        if isinstance(message, onnx.NodeProto) and message.domain not in ("", "ai.onnx"):
+            raise ValueError(
+                f"{name} has operators of {message.domain[:80]!r}, which Penumbra does not export"
+            )
+    return next((entry.value for entry in model.metadata_props if entry.key == KEY), None)
+
+
+def _messages(message: Any) -> Iterator[Any]:
+    """Yield a message of a protocol buffer and all that are in it."""
+    waiting = [message]
+    while waiting:
+        yield (message := waiting.pop())
+        for field, value in message.ListFields():
+            if field.message_type is not None:
+                waiting += [value] if hasattr(value, "ListFields") else list(value)
 
 
 def open_torchscript(content: bytes, name: str, device: str = "cpu") -> Artifact:
     """Open the content of a TorchScript archive; `name` is for messages. Raises as `load_artifact` does."""
     extra = {EXTRA_FILE: ""}
+    _check_code(content, name)
     try:
         with tracing():
             module = torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra)
@@ -193,6 +248,24 @@ def open_torchscript(content: bytes, name: str, device: str = "cpu") -> Artifact
     text = extra[EXTRA_FILE]
     text = text.decode() if isinstance(text, bytes) else text
     return Artifact(_described(text, name), _TorchScript(module.eval(), device), name)
+
+
+def _check_code(content: bytes, name: str) -> None:
+    """Refuse an archive whose members claim more than it has, or whose code opens files.
+
+    Raises:
+        ValueError: It does, or is damaged.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = archive.infolist()
+            if sum(member.file_size for member in members) > _UNPACKED * len(content):
+                raise ValueError("its members claim far more bytes than it has")
+            for member in members:
+                if member.filename.endswith(".py") and (found := _FILES.search(archive.read(member))):
+                    raise ValueError(f"its code calls {found[0].decode()}, which Penumbra does not export")
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError, zlib.error) as error:
+        raise ValueError(f"{name} is not a TorchScript archive, or is damaged ({error})") from error
 
 
 def _described(text: str | None, name: str) -> Description:

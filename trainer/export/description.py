@@ -127,9 +127,42 @@ class Description:
                 parity = Parity(sizes=sizes, counts=counts, **parity)
             for name in ("inputs", "frame_numbers", "samples"):
                 values[name] = tuple(values.get(name, ()))
-            return cls(source=Source(**values.pop("source")), parity=parity, **values)
-        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            description = cls(source=Source(**values.pop("source")), parity=parity, **values)
+        except (
+            KeyError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+            json.JSONDecodeError,
+        ) as error:
             raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
+        if wrong := description.wrong():
+            raise ValueError(
+                f"damaged metadata ({wrong} has a value that it cannot have); export the model again"
+            )
+        return description
+
+    def wrong(self) -> str:
+        """Return the name of an entry whose value tiling or a reader could not use, nothing for none."""
+        names = (*self.inputs, *self.frame_numbers, *self.samples, *self.fill)
+        fits = {
+            "inputs": bool(self.inputs) and all(isinstance(name, str) for name in names),
+            "model": all(isinstance(text, str) for text in (self.model, self.format, self.output)),
+            "halo": _within(self.halo, 0, 1 << 16),
+            "multiple": _within(self.multiple, 1, 1 << 16),
+            "bytes_per_pixel": _within(self.bytes_per_pixel, 0, 1 << 40),
+            "bytes_once": _within(self.bytes_once, 0, 1 << 62),
+            "temporal": isinstance(self.temporal, bool) and isinstance(self.per_sample, bool),
+            "fill": isinstance(self.fill, dict)
+            and all(isinstance(v, int | float) for v in self.fill.values()),
+            "source": isinstance(self.source.class_path, str) and isinstance(self.source.init_args, dict),
+        }
+        return next((name for name, good in fits.items() if not good), "")
+
+
+def _within(value: object, least: int, most: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
 
 def output_name(inputs: tuple[str, ...]) -> str:
