@@ -43,7 +43,7 @@ def uninterrupted(tmp_path_factory, cache):
 
     place = Workplace(tmp_path_factory.mktemp("whole"), cache)
     place.trainer("fit", *options(place))
-    return final(place)
+    return place
 
 
 @pytest.mark.parametrize("kill_at", [4, 8], ids=["middle of an epoch", "after an epoch"])
@@ -60,11 +60,11 @@ def test_killed_run_continues_in_its_mlflow_run_with_identical_weights(workplace
     assert len(workplace.runs) == 1
     after = RunRecord.load(workplace.runs[0])
     assert before.run_id in (None, after.run_id)  # a very early kill comes before the store's first answer
-    resumed = final(workplace)
-    assert resumed["global_step"] == uninterrupted["global_step"] == 21
-    for name, tensor in uninterrupted["state_dict"].items():
+    resumed, whole = final(workplace), final(uninterrupted)
+    assert resumed["global_step"] == whole["global_step"] == 21
+    for name, tensor in whole["state_dict"].items():
         assert torch.equal(tensor, resumed["state_dict"][name]), name
-    assert_equal_trees(uninterrupted["optimizer_states"], resumed["optimizer_states"])
+    assert_equal_trees(whole["optimizer_states"], resumed["optimizer_states"])
     client = open_client(after.tracking_uri)
     run = client.get_run(after.run_id)
     assert run.info.status == "FINISHED"
@@ -72,6 +72,15 @@ def test_killed_run_continues_in_its_mlflow_run_with_identical_weights(workplace
     for key, steps in (("train/loss_step", range(21)), ("val/psnr_wskp", (6, 13, 20))):
         history = client.get_metric_history(after.run_id, key)
         assert sorted(metric.step for metric in history) == list(steps), key
+    for key in ("train/loss_step", "train/loss_epoch", "val/psnr_wskp", "val/loss"):
+        assert recorded(workplace, key) == recorded(uninterrupted, key), key
+
+
+def recorded(place, key):
+    """Return the history of a metric in the store, steps and values."""
+    record = RunRecord.load(place.runs[0])
+    history = open_client(record.tracking_uri).get_metric_history(record.run_id, key)
+    return sorted((metric.step, metric.value) for metric in history)
 
 
 def wait_for_step(place, step, process):

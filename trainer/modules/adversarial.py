@@ -192,6 +192,7 @@ class Adversarial(Evaluated):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Let a run be validated and tested without its critics, or with others."""
+        super().on_load_checkpoint(checkpoint)
         if self._trainer is not None and self.trainer.state.fn != "fit":
             weights = checkpoint["state_dict"]
             foreign = [name for name in weights if name.startswith("critics.")]
@@ -253,7 +254,7 @@ class Adversarial(Evaluated):
         advance(self.trainer, self.trainer.optimizers[0], "step")
         numbers = self.net_side.numbers | self.critic_side.numbers
         loss = numbers.pop("train/loss")
-        self.log("train/loss_epoch", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=1)
+        self.count_loss(torch.as_tensor(loss))
         step = self.trainer.global_step
         if step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             # Not by self.log, which would repeat the numbers after batches that update nothing.

@@ -93,7 +93,8 @@ class Branches(Evaluated):
         separate = torch.stack([losses[name] for name in self.names]).sum()
         result = losses[JOINT] if self.joint else separate
         size = len(pairs[JOINT].target)
-        self.log("train/loss", result, on_step=True, on_epoch=True, sync_dist=True, batch_size=size)
+        self.log("train/loss_step", result)
+        self.count_loss(result)
         numbers = {f"train/{name}": losses[name].detach() for name in self.names}
         numbers |= {"train/separate": separate.detach(), "train/joint": losses[JOINT].detach()}
         self.log_dict(numbers, on_step=True, on_epoch=False, batch_size=size)

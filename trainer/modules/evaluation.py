@@ -16,6 +16,36 @@ from trainer.metrics.collection import METRICS, SceneMetrics
 Batch = dict[str, Any]
 
 
+class EpochMean:
+    """Mean of the losses of an epoch that outlives an interruption; Lightning's own forgets what was before.
+
+    Args:
+        epoch: Epoch of the sums.
+        total: Sum of the losses so far.
+        count: Number of them.
+    """
+
+    def __init__(self, epoch: int = -1, total: float = 0.0, count: int = 0) -> None:
+        self.epoch, self.count = epoch, count
+        self._total: Tensor | float = total
+
+    def add(self, epoch: int, loss: Tensor) -> None:
+        """Add a loss; the first one of another epoch begins anew. Nothing waits for the device."""
+        if epoch != self.epoch:
+            self.epoch, self.count, self._total = epoch, 0, 0.0
+        self.count += 1
+        self._total = self._total + loss.detach().float()
+
+    @property
+    def mean(self) -> float:
+        """Mean of what was added."""
+        return float(self._total) / self.count
+
+    def state(self) -> dict[str, Any]:
+        """Return the constructor's arguments."""
+        return {"epoch": self.epoch, "total": float(self._total), "count": self.count}
+
+
 class Evaluated(LightningModule):
     """A denoiser that is validated on crops and tested on whole frames.
 
@@ -34,6 +64,7 @@ class Evaluated(LightningModule):
         self.net = net
         self.scores: SceneMetrics | None = None
         self.input_scores: SceneMetrics | None = None
+        self._epoch_loss = EpochMean()
 
     def keep_arguments(self) -> None:
         """Save the constructor's arguments as hyper-parameters.
@@ -67,6 +98,15 @@ class Evaluated(LightningModule):
             target: Exposed reference.
         """
         raise TypeError(f"{type(self).__name__} does not define validation_loss")
+
+    def count_loss(self, loss: Tensor) -> None:
+        """Add the loss of a step to the mean of the epoch, `train/loss_epoch`."""
+        self._epoch_loss.add(self.current_epoch, loss)
+
+    def on_train_epoch_end(self) -> None:
+        """Log the mean loss of the epoch."""
+        if self._epoch_loss.count:
+            self.log("train/loss_epoch", self._epoch_loss.mean, rank_zero_only=True)
 
     def on_validation_start(self) -> None:
         """Do not send buffers of the network with each batch: ranks may have one batch more or less."""
@@ -125,8 +165,13 @@ class Evaluated(LightningModule):
         From a configuration the hyper-parameters are class paths, and the checkpoint alone rebuilds the
         network; a module that was made in Python is loaded with `load_from_checkpoint(path, net=…)`.
         """
+        checkpoint["epoch_loss"] = self._epoch_loss.state()
         saved = checkpoint.get("hyper_parameters", {})
         checkpoint["hyper_parameters"] = {key: value for key, value in saved.items() if _is_plain(value)}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on with the sums of an epoch that was interrupted."""
+        self._epoch_loss = EpochMean(**checkpoint.get("epoch_loss", {}))
 
     def _new_scores(self, split: str) -> SceneMetrics:
         scenes = self.trainer.datamodule.scenes(split)  # type: ignore[attr-defined]

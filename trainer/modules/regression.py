@@ -56,7 +56,8 @@ class Regression(Evaluated):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of one batch."""
         loss = self._compared(batch) if self.pairs else self.loss(*self.exposed(batch))
-        self.log("train/loss", loss, on_step=True, on_epoch=True, batch_size=len(batch["reference"]))
+        self.log("train/loss_step", loss)
+        self.count_loss(loss)
         return loss
 
     def validation_loss(self, batch: Batch, output: Tensor, target: Tensor) -> Tensor:
