@@ -58,7 +58,7 @@ def one_process(batches):
     for number, batch in enumerate(batches):
         pair = net.training_pairs(batch)["color"]
         real, fake = pair.target, pair.output.detach()
-        u = torch.cat([mixing((1, 0, number, rank, 0), real[:2]) for rank in range(2)])
+        u = mixing((1, 0, number, 0, 0), real)
         between = (u * fake + (1 - u) * real).requires_grad_()
         slope = torch.autograd.grad(critic(between).sum(), between, create_graph=True)[0]
         penalty = ((slope.square().sum((1, 2, 3)) + 1e-12).sqrt() - 1).square().mean()

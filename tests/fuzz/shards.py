@@ -170,7 +170,7 @@ def _altered(chance: random.Random, values: Any) -> Any:
     if isinstance(holder, dict) and chance.random() < 0.1:
         del holder[key]
         if chance.random() < 0.5:
-            holder[chance.choice(("x", "", key.upper()))] = old
+            holder[chance.choice(("x", "", str(key).upper()))] = old
     else:
         holder[key] = chance.choice(ways)()
     return values

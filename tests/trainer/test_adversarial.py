@@ -91,7 +91,7 @@ def literal(net, critics, data, first, halved=True, names=("color",)):
         loss = 0
         for index, name in enumerate(names):
             critic, real, fake = critics[name], pairs[name].target, pairs[name].output.detach()
-            u = mixing((1, 0, number, index), real)
+            u = mixing((1, 0, number, 0, index), real)
             between = (fake * u + real * (1 - u)).requires_grad_(True)
             slope = torch.autograd.grad(critic(between), between, torch.ones(len(u)), create_graph=True)[0]
             penalty = ((slope.pow(2).sum((1, 2, 3)).sqrt() - 1) ** 2).mean()

@@ -31,7 +31,7 @@ from trainer.export.torchscript import EXTRA_FILE
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}
 """File suffix of each format."""
 
-_FILES = re.compile(rb"\b(from_file|torch\.save|torch\.load|ops\.(?!prim\b)\w+)\b")
+_FILES = re.compile(rb"(?<![.\w])(torch\.from_file|torch\.save|torch\.load|ops\.(?!prim\b)\w+)\b")
 """TorchScript code that opens files, or calls operators of other libraries."""
 
 _UNPACKED = 20

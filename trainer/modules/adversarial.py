@@ -208,7 +208,8 @@ class Adversarial(Evaluated):
         numbers: dict[str, list[Tensor]] = {"loss": [], "gap": [], "penalty": []}
         for index, (name, critic) in enumerate(self.critics.items()):
             real, fake = pairs[name].target, pairs[name].output.detach()
-            mix = mixing((self.seed, self.current_epoch, batch_idx, index), real, self.global_rank)
+            # The zero keeps the numbers of runs that began when ranks had keys of their own.
+            mix = mixing((self.seed, self.current_epoch, batch_idx, 0, index), real, self.global_rank)
             gap = critic(real).float().mean() - critic(fake).float().mean()
             penalty = gradient_penalty(critic, real, fake, mix)
             loss = (-0.5 if self.halved else -1.0) * gap + self.penalty_weight * penalty
