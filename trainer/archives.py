@@ -64,7 +64,7 @@ def check_archive(path: Path) -> None:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            members = _members(archive, path.stat().st_size)
+            members = member_sizes(archive, path.stat().st_size)
             name = next((name for name in members if name.endswith("/data.pkl")), None)
             if name is None:
                 raise ValueError("its archive has no data.pkl")
@@ -75,14 +75,28 @@ def check_archive(path: Path) -> None:
         raise ValueError(str(error) or "its archive is damaged") from error
 
 
-def _members(archive: zipfile.ZipFile, size: int) -> dict[str, int]:
-    """Return the size of each member; none is compressed, and together they are no larger than the file."""
+def member_sizes(archive: zipfile.ZipFile, size: int, ratio: int = 1) -> dict[str, int]:
+    """Return the bytes of each member of an archive that claims no more than it has.
+
+    Args:
+        archive: The archive.
+        size: Bytes of its file.
+        ratio: How much larger its members may be when they are unpacked; 1: none is compressed.
+
+    Raises:
+        ValueError: It claims more, or names members twice.
+    """
     members = archive.infolist()
     sizes = {member.filename: member.file_size for member in members}
     if len(sizes) < len(members) or len(members) > _MEMBERS:
         raise ValueError("its archive has members of one name, or too many")
-    if any(member.compress_type != zipfile.ZIP_STORED for member in members) or sum(sizes.values()) > size:
-        raise ValueError("members of its archive claim more bytes than it has, or are compressed")
+    stored = [member for member in members if member.compress_type == zipfile.ZIP_STORED]
+    if ratio == 1 and len(stored) < len(members):
+        raise ValueError("members of its archive are compressed")
+    packed = sum(member.compress_size for member in members)
+    wrong = any(member.compress_size != member.file_size for member in stored)
+    if wrong or packed > size or sum(sizes.values()) > ratio * size:
+        raise ValueError("members of its archive claim more bytes than it has")
     return sizes
 
 

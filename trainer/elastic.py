@@ -56,7 +56,10 @@ def agree(store: dist.Store, rank: int, world: int, patience: timedelta) -> str:
     if rank > 0:
         word = uuid.uuid4().hex
         store.set(f"ask/{rank}", word)
-        store.wait([f"answer/{word}"], patience)
+        try:
+            store.wait([f"answer/{word}"], patience)
+        except dist.DistStoreError as error:
+            raise TimeoutError(f"rank {rank} waited {patience} for the first rank, in vain") from error
         name = store.get(f"answer/{word}").decode()
         store.set(f"known/{name}/{rank}", "")
         return name

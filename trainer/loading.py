@@ -23,6 +23,7 @@ from typing import Any, Literal
 import torch
 
 from data.manifest import file_sha256
+from data.remote_patience import shown
 from models.denoiser import Denoiser
 from trainer.building import FORMS, build, class_path_of, find_class, outlined
 from trainer.configs import UsageError
@@ -215,6 +216,8 @@ def _published_method(checkpoint: Mapping[str, Any]) -> Literal["wskp", "afgsa"]
     inner: Any = checkpoint
     for wrapper in ("model_state_dict", "state_dict"):
         inner = inner.get(wrapper, inner) if isinstance(inner, Mapping) else inner
+    if not isinstance(inner, Mapping):
+        return None
     names = {str(name).removeprefix("module.").split(".")[0] for name in inner}
     if names & {"conv_map", "conv_aenc1", "transformer_blocks"}:
         return "afgsa"
@@ -284,6 +287,9 @@ def _from_mlflow(uri: str, device: str, tracking_uri: str | None) -> Loaded:
                 place = mlflow.artifacts.download_artifacts(artifact_uri=uri, dst_path=folder)
         except (MlflowException, OSError) as error:
             first = (str(error).splitlines() or [repr(error)])[0]
-            raise ValueError(f"--model {uri}: {first} (store: {store}; `trainer models` lists it)") from error
+            told = first.replace(store, shown(store))  # which may hold a password
+            raise ValueError(
+                f"--model {uri}: {told} (store: {shown(store)}; `trainer models` lists it)"
+            ) from error
         loaded = _from_path(Path(place), device)
     return replace(loaded, source=replace(loaded.source, reference=uri))

@@ -172,10 +172,39 @@ def current_launch(environment: Mapping[str, str] = os.environ) -> Launch | None
     return None
 
 
-def begin_launch(folder: Path, launch: Launch) -> None:
-    """Note in a run's folder that a launch trains it."""
+def begin_launch(folder: Path, launch: Launch, checkpoint: str | None = None) -> None:
+    """Note in a run's folder that a launch trains it.
+
+    Args:
+        folder: The run's.
+        launch: The launch.
+        checkpoint: What it starts from.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / LAUNCH_FILE, {"launch": launch.identity, "finished": False})
+    start = {"checkpoint": checkpoint, "last": _stamp(folder)}
+    _write(folder / LAUNCH_FILE, {"launch": launch.identity, "finished": False, **start})
+
+
+def checkpoint_of_launch(folder: Path) -> Path | None:
+    """Return what a restarted launch goes on from: the last checkpoint it saved, or what it started from.
+
+    None where it started from nothing and has saved none.
+    """
+    noted = _read(folder / LAUNCH_FILE)
+    if _stamp(folder) not in (None, noted.get("last")):
+        return _last(folder)
+    start = noted.get("checkpoint")
+    return Path(start) if isinstance(start, str) else None
+
+
+def _last(folder: Path) -> Path:
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def _stamp(folder: Path) -> int | None:
+    """Return when a run's last checkpoint was written, None where there is none."""
+    path = _last(folder)
+    return path.stat().st_mtime_ns if path.is_file() else None
 
 
 def end_launch(folder: Path) -> None:

@@ -84,6 +84,10 @@ class MLflowTracking(Logger):
         self._sampler: Sampler | None = None
         self._lock = threading.Lock()
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> MLflowTracking:
+        """Return the logger itself: a copied module, such as one of averaged weights, has the same run."""
+        return self
+
     @property
     def name(self) -> str:
         """Name of the experiment."""

@@ -219,8 +219,8 @@ class TrainingCLI(LightningCLI):
         folder = launch and runs.run_of_launch(launch, Path(logger.root), logger.experiment)
         if not folder:
             return False
-        newest = folder / "checkpoints" / "last.ckpt"
-        config.ckpt_path = str(newest) if newest.is_file() else None
+        newest = runs.checkpoint_of_launch(folder)
+        config.ckpt_path = str(newest) if newest else None
         logger.resume_from = str(folder)
         if getattr(rank_zero_only, "rank", 0) == 0:  # Lightning sets the attribute on its function
             place = f"from {newest}" if config.ckpt_path else "from its beginning, it has no checkpoint yet"
@@ -232,7 +232,7 @@ class TrainingCLI(LightningCLI):
         self.launch = runs.current_launch()
         logger = self.trainer.logger
         if self.launch and self.trainer.is_global_zero and isinstance(logger, MLflowTracking):
-            runs.begin_launch(logger.folder, self.launch)
+            runs.begin_launch(logger.folder, self.launch, self.config.fit.ckpt_path)
 
     def after_fit(self) -> None:
         """Note that the run is complete."""

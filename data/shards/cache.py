@@ -204,22 +204,27 @@ def _is_still(path: Path, file: IO[bytes]) -> bool:
 def _lock_unused(path: Path, stack: contextlib.ExitStack) -> bool:
     """Lock a shard until the stack is left; False where somebody uses it."""
     try:
-        file = stack.enter_context(path.open("rb"))
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (FileNotFoundError, BlockingIOError):
+        file = path.open("r+b")  # network file systems lock exclusively only for those who may write
+    except OSError:
         return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()  # there may be more shards than files that a process may open
+        return False
+    stack.enter_context(file)
     return True
 
 
 def _reserved(partial: Path) -> int:
     """Return the bytes that a download will take; what a dead process left is removed and takes none."""
     try:
-        with partial.open("rb") as file:
+        with partial.open("r+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_still(partial, file):
                 partial.unlink(missing_ok=True)
     except FileNotFoundError:
         return 0
-    except BlockingIOError:
+    except OSError:  # locked, or not to be locked here
         return int(partial.name.split(".")[2])
     return 0

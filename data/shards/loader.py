@@ -231,8 +231,8 @@ class TrainingLoader(_Loader):
 class EvaluationLoader(_Loader):
     """Every sample of a split once over all ranks, in the order of the shards.
 
-    A rank for which no sample is left reads the first one all the same, since it must take part in the sums
-    of all ranks; its batch has no `scene` and no `key`, so that it counts nowhere.
+    A rank without a sample that can be read reads one of another all the same, since it must take part in the
+    sums of all ranks; its batch has no `scene` and no `key`, so that it counts nowhere.
 
     Args:
         batches: The samples.
@@ -255,15 +255,19 @@ class EvaluationLoader(_Loader):
     ) -> None:
         super().__init__(batches, workers, pin_memory)
         mine = evaluation_samples(len(batches), rank, world).tolist()
-        self.counts = bool(mine)
-        mine = mine or [0]
         self.orders = self._orders_of(0, [mine[i : i + batch_size] for i in range(0, len(mine), batch_size)])
 
     def __len__(self) -> int:
-        return len(self.orders)
+        return max(1, len(self.orders))
 
     def __iter__(self) -> Iterator[Batch]:
+        served = False
         for batch in self._read(self.orders):
-            if not self.counts:
-                batch["scene"], batch["key"] = [], []
+            served = True
             yield batch
+        if served:
+            return
+        for batch in self._read(self._orders_of(0, [[number] for number in range(len(self.batches))])):
+            batch["scene"], batch["key"] = [], []
+            yield batch
+            return

@@ -206,7 +206,7 @@ def compare(disturbed: Training, alone: Training, whole: Training) -> list[Row]:
     return [
         row("weights differ from one undisturbed process by", apart, "", "= 0", apart == 0),
         row("MLflow runs", len(disturbed.runs), "", "= 1", len(disturbed.runs) == 1),
-        row("metrics", len(complete), ""),
+        row("metrics", len(complete), "", "> 0", len(complete) > 0),
         row("values of metrics", sum(map(len, complete.values())), ""),
         row("values that are missing", gaps, "", "= 0", gaps == 0),
         row("values that are there twice", twice, "", "= 0", twice == 0),

@@ -33,7 +33,7 @@ from types import ModuleType
 
 from tests.fuzz.bytewise import Files
 
-SECONDS = 20
+SECONDS = 60
 BATCH = 2500
 MOST = 20
 """Violations after which a run stops."""
@@ -180,6 +180,8 @@ def batch(module: ModuleType, first: int, last: int, seed: int, folder: Path) ->
             counts[_one(module, root)] += 1
             signal.alarm(0)
             took = _memory("VmHWM") - before
+            if took > most:
+                raise Violation(f"it took {took >> 20} MiB of memory, its bound are {most >> 20} MiB")
             peak, share = max(peak, took), max(share, took / most)
             shutil.rmtree(root)
             resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))

@@ -16,7 +16,7 @@ def attempt(store, ranks, world, patience=timedelta(seconds=20)):
     def run(rank):
         try:
             names[rank] = agree(store, rank, world, patience)
-        except (TimeoutError, dist.DistStoreError) as error:
+        except TimeoutError as error:
             names[rank] = error
 
     threads = [threading.Thread(target=run, args=(rank,)) for rank in ranks]
@@ -52,3 +52,8 @@ def test_words_of_ranks_that_were_killed_while_they_asked_do_no_harm(store):
 def test_rank_that_does_not_start_is_named(store):
     names = attempt(store, [0, 2], 3, timedelta(seconds=0.2))
     assert "ranks 1 of 3 did not start" in str(names[0])
+
+
+def test_rank_whose_first_rank_does_not_start_says_so(store):
+    names = attempt(store, [1], 2, timedelta(seconds=0.2))
+    assert "rank 1 waited" in str(names[1])

@@ -1,9 +1,13 @@
+import os
+from pathlib import Path
+
 import pytest
 
 from trainer.runs import (
     Launch,
     RunRecord,
     begin_launch,
+    checkpoint_of_launch,
     current_launch,
     end_launch,
     find_checkpoint,
@@ -95,6 +99,26 @@ def test_finished_run_is_not_continued_by_its_launch(tmp_path):
     begin_launch(folder, Launch("a"))
     end_launch(folder)
     assert run_of_launch(Launch("a", restarts=True, unfinished=True), tmp_path, "exp") is None
+
+
+def test_restart_goes_on_from_what_its_launch_saved_or_started_from(tmp_path):
+    folder = make_run(tmp_path, "20260101-000000")
+    last = folder / "checkpoints" / "last.ckpt"
+    begin_launch(folder, Launch("a"))
+    assert checkpoint_of_launch(folder) is None
+    begin_launch(folder, Launch("a"), "elsewhere/best.ckpt")
+    assert checkpoint_of_launch(folder) == Path("elsewhere/best.ckpt")
+    last.write_bytes(b"x")
+    assert checkpoint_of_launch(folder) == last
+
+
+def test_restart_does_not_take_the_last_checkpoint_that_was_there_before_its_launch(tmp_path):
+    folder = make_run(tmp_path, "20260101-000000", "last", "best")
+    checkpoints = folder / "checkpoints"
+    begin_launch(folder, Launch("a"), str(checkpoints / "best.ckpt"))
+    assert checkpoint_of_launch(folder) == checkpoints / "best.ckpt"
+    os.utime(checkpoints / "last.ckpt", ns=(1, 1))  # saved anew
+    assert checkpoint_of_launch(folder) == checkpoints / "last.ckpt"
 
 
 def test_damaged_note_of_a_launch_is_no_launch(tmp_path):

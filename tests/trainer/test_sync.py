@@ -86,6 +86,35 @@ def test_sync_of_all_finds_the_runs_that_have_something_left(proxy, capsys):
     assert "nothing is left to send below runs" in capsys.readouterr().out
 
 
+def test_sync_of_all_sends_the_others_of_a_damaged_run(proxy, capsys):
+    damaged, log = unsent(proxy.uri), unsent(proxy.uri)
+    (damaged.folder / "run.json").write_text("{")
+    proxy.start()
+    assert synced(every=True) == 1
+    assert "run.json is damaged" in capsys.readouterr().err
+    assert_complete(log)
+
+
+def test_lock_is_free_once_it_is_released_even_if_a_forked_process_lives_on(proxy):
+    log = unsent(proxy.uri)
+    lock = Lock(log.folder)
+    assert lock.acquire()
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(writing)
+        os.read(reading, 1)  # until the test ends
+        os._exit(0)
+    try:
+        lock.release()
+        other = Lock(log.folder)
+        assert other.acquire()
+        other.release()
+    finally:
+        os.close(writing)
+        os.waitpid(child, 0)
+
+
 def test_sync_of_nothing_asks_for_runs_and_of_another_folder_says_that_it_is_none(workplace):
     with pytest.raises(UsageError, match="--all"):
         synced()

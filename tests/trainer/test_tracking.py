@@ -213,6 +213,23 @@ def test_entry_that_the_server_refuses_is_put_aside_and_the_rest_arrives(proxy, 
     assert "bad//name" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("damage", ["missing", "torn"])
+def test_picture_that_was_lost_with_the_power_does_not_keep_back_what_comes_after(proxy, damage):
+    log = logger(proxy.uri)
+    log.log_picture(Image.new("RGB", (8, 8)), key="validation/a", step=1)
+    log.log_metrics({"loss": 1.0}, step=1)
+    (path,) = [p for p in (log.folder / "spool" / "files").rglob("*") if p.is_file()]
+    path.unlink()
+    if damage == "torn":
+        path.write_bytes(b"")
+    proxy.start()
+    log.finalize("success")
+    assert history(log, "loss") == [(1, 1.0)]
+    assert stored(log).info.status == "FINISHED"
+    (refused,) = rejected(log)
+    assert path.name in refused
+
+
 def test_server_that_is_away_at_the_start_gets_everything_when_it_comes(proxy, capsys):
     log = logger(proxy.uri)
     record_all(log)

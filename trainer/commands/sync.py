@@ -35,8 +35,6 @@ def run(arguments: argparse.Namespace) -> int:
         UsageError: No run is named.
         ValueError: A folder is not a run.
     """
-    from trainer.spool.delivery import left
-
     if not arguments.runs and not arguments.all:
         raise UsageError("name the folders of runs (runs/EXPERIMENT/NAME), or give --all")
     folders = list(arguments.runs)
@@ -44,10 +42,29 @@ def run(arguments: argparse.Namespace) -> int:
         RunRecord.load(folder)
     if arguments.all:
         found = sorted(path.parent for path in arguments.root.glob(f"*/*/{RUN_FILE}"))
-        folders += [folder for folder in found if left(folder)]
+        folders += [folder for folder in found if _has_left(folder)]
         if not folders:
             print(f"nothing is left to send below {arguments.root}")
-    return max([send(folder) for folder in folders], default=0)
+    return max([_sent(folder) for folder in folders], default=0)
+
+
+def _has_left(folder: Path) -> bool:
+    """Return whether a run has something left, or is so damaged that `_sent` has to tell."""
+    from trainer.spool.delivery import left
+
+    try:
+        return left(folder) > 0
+    except (ValueError, OSError):
+        return True
+
+
+def _sent(folder: Path) -> int:
+    """Send what is left of one run; a damaged one does not keep the others from being sent."""
+    try:
+        return send(folder)
+    except (ValueError, OSError) as error:
+        print(f"{folder}: {error}", file=sys.stderr)
+        return 1
 
 
 def send(folder: Path) -> int:

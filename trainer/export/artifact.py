@@ -24,6 +24,7 @@ from torch import Tensor
 from data.buffers import SAMPLES, buffer, sample_channels
 from models.denoiser import Denoised
 from models.ops.per_sample import check_samples, sample_depths
+from trainer.archives import member_sizes
 from trainer.export.description import KEY, Description
 from trainer.export.entry import tracing
 from trainer.export.torchscript import EXTRA_FILE
@@ -31,8 +32,14 @@ from trainer.export.torchscript import EXTRA_FILE
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}
 """File suffix of each format."""
 
-_FILES = re.compile(rb"(?<![.\w])(torch\.from_file|torch\.save|torch\.load|ops\.(?!prim\b)\w+)\b")
-"""TorchScript code that opens files, or calls operators of other libraries."""
+_FILES = re.compile(
+    rb"(?<!\w)(from_file|save|load|torch\s*\.\s*classes)(?!\w)"
+    rb"|(?<![\w.])ops(?!\s*\.\s*prim\b)(?!\w)"
+    rb'|(?<!\w)getattr(?!\s*\(\s*[\w.]+\s*,\s*"\d+"\s*\))(?!\w)'
+)
+"""Names in TorchScript code, however they are reached, that open files, or lead to operators and classes of
+other libraries. Exported denoisers have none: `getattr` only with the number of a part of a list, and `ops`
+only within the name of a class."""
 
 _UNPACKED = 20
 
@@ -242,7 +249,7 @@ def open_torchscript(content: bytes, name: str, device: str = "cpu") -> Artifact
     try:
         with tracing():
             module = torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra)
-    except RuntimeError as error:
+    except (RuntimeError, IndexError) as error:
         first = str(error).splitlines()[0][:200]
         raise ValueError(f"{name} is not a TorchScript archive, or is damaged ({first})") from error
     text = extra[EXTRA_FILE]
@@ -258,12 +265,10 @@ def _check_code(content: bytes, name: str) -> None:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = archive.infolist()
-            if sum(member.file_size for member in members) > _UNPACKED * len(content):
-                raise ValueError("its members claim far more bytes than it has")
-            for member in members:
-                if member.filename.endswith(".py") and (found := _FILES.search(archive.read(member))):
-                    raise ValueError(f"its code calls {found[0].decode()}, which Penumbra does not export")
+            for member in member_sizes(archive, len(content), _UNPACKED):
+                data = archive.read(member)  # compares its checksum, which PyTorch does not
+                if member.endswith(".py") and (found := _FILES.search(data)):
+                    raise ValueError(f"its code uses {found[0].decode()}, which Penumbra does not export")
     except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError, zlib.error) as error:
         raise ValueError(f"{name} is not a TorchScript archive, or is damaged ({error})") from error
 

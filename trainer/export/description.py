@@ -128,15 +128,10 @@ class Description:
             for name in ("inputs", "frame_numbers", "samples"):
                 values[name] = tuple(values.get(name, ()))
             description = cls(source=Source(**values.pop("source")), parity=parity, **values)
-        except (
-            KeyError,
-            TypeError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-            json.JSONDecodeError,
-        ) as error:
+        except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
+        except json.JSONDecodeError as error:
+            raise ValueError(f"damaged metadata ({error}); export the model again") from error
         if wrong := description.wrong():
             raise ValueError(
                 f"damaged metadata ({wrong} has a value that it cannot have); export the model again"
@@ -145,7 +140,7 @@ class Description:
 
     def wrong(self) -> str:
         """Return the name of an entry whose value tiling or a reader could not use, nothing for none."""
-        names = (*self.inputs, *self.frame_numbers, *self.samples, *self.fill)
+        names = (*self.inputs, *self.frame_numbers, *self.samples)
         fits = {
             "inputs": bool(self.inputs) and all(isinstance(name, str) for name in names),
             "model": all(isinstance(text, str) for text in (self.model, self.format, self.output)),

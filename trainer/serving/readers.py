@@ -50,7 +50,7 @@ class Readers:
     def read(
         self, folder: Path, name: str, layers: Mapping[str, str], ticket: Ticket
     ) -> tuple[Frame, list[str]]:
-        """Return a frame and the remarks of its reader; raises as `list`."""
+        """Return a frame and the remarks of its reader; raises as `frames`."""
         what = {"what": "read", "folder": str(folder), "name": name, "layers": dict(layers)}
         return unpack(self._ask(what, ticket))
 

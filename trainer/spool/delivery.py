@@ -223,7 +223,12 @@ class Delivery:
 
         key = event["key"].replace("/", "~")
         name = f"{key}+step+{event['step']}+timestamp+{event['t']}+{event['sha256'][:32]}"
-        with tempfile.TemporaryDirectory() as folder, Image.open(self._file(event)) as picture:
+        try:
+            picture = Image.open(self._file(event))
+            picture.load()
+        except OSError as error:  # it will not get better, and what is behind it must not wait
+            raise RefusedError(f"{event['file']} cannot be read: {error}") from error
+        with tempfile.TemporaryDirectory() as folder, picture:
             whole, small = Path(folder) / f"{name}.png", Path(folder) / f"{name}+compressed.webp"
             whole.symlink_to(self._file(event).resolve())
             compress_image_size(picture).save(small)
@@ -306,7 +311,11 @@ class Delivery:
         self.say(f"Refused by {described(self.uri)}: {what}: {why} (kept in {shown(path)})")
 
     def _file(self, event: Event) -> Path:
-        return self.folder / SPOOL / str(event["file"])
+        """Return the copy of a file; one that is lost must not keep back what comes after it."""
+        path = self.folder / SPOOL / str(event["file"])
+        if not path.is_file():
+            raise RefusedError(f"{path} is missing")
+        return path
 
     def ask(self, action: Callable[[MlflowClient], T]) -> T:
         """Return the answer of the store.

@@ -52,6 +52,8 @@ class Lock:
     def release(self) -> None:
         """Let others send."""
         if self._file is not None:
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._file, fcntl.LOCK_UN)  # readers of data were forked with it open
             os.close(self._file)
             self._file = None
 
@@ -152,11 +154,11 @@ class Sender(threading.Thread):
 
     def _turn(self) -> float:
         """Send a group; returns the seconds to rest."""
-        if not self._lock.acquire():
-            return 1.0  # another process sends this journal
         used = time.thread_time()
-        self._busy = True
         try:
+            if not self._lock.acquire():
+                return 1.0  # another process sends this journal
+            self._busy = True
             moved = self._delivery.step()
         except OutageError as outage:
             self._fail(outage)

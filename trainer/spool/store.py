@@ -9,6 +9,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from data.remote_patience import shown
+
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
@@ -40,7 +42,7 @@ def is_server(uri: str) -> bool:
 
 def described(uri: str) -> str:
     """Return what to call a store in messages."""
-    return f"the tracking server {uri}" if is_server(uri) else f"the tracking store {uri}"
+    return f"the tracking server {shown(uri)}" if is_server(uri) else f"the tracking store {shown(uri)}"
 
 
 def unreachable(uri: str, timeout_s: float = 5.0) -> str | None:
