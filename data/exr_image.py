@@ -32,7 +32,7 @@ MAX_BYTES = 1 << 34
 """Largest image that is read, as float32."""
 
 COPIES = 4
-"""How many times the float32 pixels of the largest window, all channels, reading a file takes in memory."""
+"""Reading a file takes at most this many times the float32 pixels of its largest window or tile."""
 
 SCRATCH = 64 << 20
 """Bytes that reading a file may take beside that."""
@@ -122,7 +122,7 @@ def read_exr(path: str | Path, keep_half: bool = False) -> ExrImage:
 
 
 def exr_extent(path: str | Path) -> tuple[int, int, int]:
-    """Return the rows and columns of a file's largest window, and its channels, without reading pixels.
+    """Return rows and columns of a file's largest window or tile, and its channels, without reading pixels.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -135,7 +135,7 @@ def exr_extent(path: str | Path) -> tuple[int, int, int]:
     _check_size(path, headers)
     if not headers:
         raise ValueError(f"{path}: EXR file without parts")
-    sizes = [_extent(header[window]) for header in headers for window in ("dataWindow", "displayWindow")]
+    sizes = [size for header in headers for size in (_allocated(header), _extent(header["displayWindow"]))]
     count = sum(len(header["channels"]) for header in headers)
     return max(height for _, height in sizes), max(width for width, _ in sizes), count
 
@@ -244,7 +244,7 @@ def _check_size(path: Path, headers: list[dict[str, Any]]) -> None:
     stored = path.stat().st_size
     claimed = placed = chunks = 0
     for header in headers:
-        width, height = _extent(header["dataWindow"])
+        width, height = _allocated(header)
         shown = _extent(header["displayWindow"])
         if min(width, height, *shown) < 1:
             raise ValueError(f"{path}: damaged EXR file: a window of the header is empty; render it again")
@@ -271,6 +271,15 @@ def _check_size(path: Path, headers: list[dict[str, Any]]) -> None:
 def _extent(window: Any) -> tuple[int, int]:
     (left, top), (right, bottom) = (np.asarray(v).tolist() for v in window)
     return right - left + 1, bottom - top + 1
+
+
+def _allocated(header: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the columns and rows that the library makes for a data window: at least those of a tile."""
+    width, height = _extent(header["dataWindow"])
+    tiles = header.get("tiles")
+    if tiles is None or min(width, height) < 1:
+        return width, height
+    return max(width, int(tiles.xSize)), max(height, int(tiles.ySize))
 
 
 def _full_name(name: str, part: str, several: bool, taken: Collection[str]) -> str:

@@ -26,3 +26,13 @@ def no_gradients() -> Iterator[None]:
     """Compute as inference does, without a graph."""
     with torch.no_grad():
         yield
+
+
+def pytest_collection_modifyitems(items):
+    """Mark what starts Ray clusters, or runs all of the README's page: a quarter of an hour."""
+    for item in items:
+        place = item.path.as_posix()
+        if item.get_closest_marker("slow") and (
+            "/trainer/cluster/" in place or place.endswith("stack/test_page.py")
+        ):
+            item.add_marker(pytest.mark.cluster)

@@ -8,6 +8,7 @@ import importlib
 import importlib.util
 import os
 import re
+import signal
 import sys
 
 from trainer.configs import UsageError
@@ -104,6 +105,8 @@ def main() -> int:
         message = foreseen(error)
         if message is None or os.environ.get("PENUMBRA_TRACEBACK"):
             raise
+        # PyTorch's handler raises when a process that reads data ends, also while this one is ending.
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         print(f"error: {message}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1
 

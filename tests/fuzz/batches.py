@@ -4,6 +4,7 @@ A format is a module of this package that says what is altered and what reads it
 
     BOUND                          bytes that reading may take more than the process has
     extra(folder)                  as many more for this input
+    SLACK                          optional: bytes that it could take, which are then a violation
     bases()                        inputs that can be read: a list of name of a file → content
     mutated(bases, seed, number)   input `number`, always the same
     read_all(folder)               read the input; ValueError and OSError refuse it
@@ -176,7 +177,7 @@ def batch(module: ModuleType, first: int, last: int, seed: int, folder: Path) ->
             signal.alarm(SECONDS)
             before = _limit(module.BOUND)
             most = module.BOUND + module.extra(root)
-            _limit(most)
+            _limit(most + getattr(module, "SLACK", 0))
             counts[_one(module, root)] += 1
             signal.alarm(0)
             took = _memory("VmHWM") - before
