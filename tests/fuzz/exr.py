@@ -31,7 +31,7 @@ from tests.fuzz.bytewise import Files, numbered, turned
 FILE = "color.exr"
 BOUND = SCRATCH
 SLACK = 4 << 30
-"""The library calls a file damaged where it gets no memory, so it gets more, and what it took is looked at."""
+"""The library calls a file damaged where it gets no memory, so it gets more; what it took is looked at."""
 KINDS = ("scanlineimage", "tiledimage", "deepscanline", "deeptile", "", "x" * 300)
 
 
@@ -207,15 +207,16 @@ def _attribute(chance: random.Random, data: bytes, entry: Entry) -> bytes:
 
 def _channel(chance: random.Random, data: bytes, entry: Entry) -> bytes:
     """Change the name, type or sampling of a channel."""
-    place, starts = entry.place, []
-    while data[place]:
-        starts.append(place)
-        place = data.index(0, place) + 17
-    name = chance.choice(starts)
-    numbers = data.index(0, name) + 1
-    if chance.random() < 0.7:
+    place, starts, end = entry.place, [], entry.place + entry.size
+    while place < end and data[place] and (zero := data.find(0, place)) >= 0:
+        starts.append((place, zero + 1))
+        place = zero + 17
+    if not starts:  # altered before
+        return turned(chance, data, entry.place, end)
+    name, numbers = chance.choice(starts)
+    if chance.random() < 0.7 and numbers + 16 <= len(data):
         return numbered(chance, data, numbers + 4 * chance.choice((0, 0, 2, 3)), 4)
-    return turned(chance, data, name, numbers)
+    return turned(chance, data, name, min(numbers, len(data)))
 
 
 def run(count: int, seed: int = 1) -> dict[str, int]:
