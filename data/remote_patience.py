@@ -104,6 +104,8 @@ def patiently(doing: str, url: str, attempt: Callable[[], Result]) -> Result:
 def shown(url: str) -> str:
     """Return a URL for messages: without password and without what follows a question mark."""
     parts = urlsplit(url)
+    if not parts.netloc:  # a file, such as sqlite:////runs/mlflow.db, which would lose slashes
+        return url
     return parts._replace(netloc=parts.netloc.rpartition("@")[2], query="", fragment="").geturl()
 
 

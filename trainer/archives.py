@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import pickletools
 import re
+import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -71,7 +72,14 @@ def check_archive(path: Path) -> None:
             folder = name.removesuffix("data.pkl")
             sizes = {n.removeprefix(folder): size for n, size in members.items() if n.startswith(folder)}
             _Outline(sizes).follow(archive.read(name))
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError) as error:
+    except (
+        zipfile.BadZipFile,
+        NotImplementedError,
+        EOFError,
+        RuntimeError,
+        OverflowError,
+        struct.error,
+    ) as error:
         raise ValueError(str(error) or "its archive is damaged") from error
 
 
@@ -95,6 +103,7 @@ def member_sizes(archive: zipfile.ZipFile, size: int, ratio: int = 1) -> dict[st
         raise ValueError("members of its archive are compressed")
     packed = sum(member.compress_size for member in members)
     wrong = any(member.compress_size != member.file_size for member in stored)
+    wrong = wrong or any(not 0 <= member.header_offset < size for member in members)
     if wrong or packed > size or sum(sizes.values()) > ratio * size:
         raise ValueError("members of its archive claim more bytes than it has")
     return sizes

@@ -13,7 +13,9 @@ import onnx
 import pytest
 import torch
 
+from data.exr_image import read_exr
 from models import WSKP
+from tests.fuzz import exr
 from tests.fuzz.checkpoints import TREE
 from trainer.archives import ForeignObject, check_archive
 from trainer.building import TRUSTED
@@ -181,6 +183,16 @@ def test_torchscript_that_opens_files_is_refused_however_it_says_so(tmp_path, sp
             copy.writestr(name, original.read(name).replace(b"torch.from_file", spelling.encode()))
     with pytest.raises(ValueError, match=r"its code uses (from_file|getattr|save|ops)"):
         load_artifact(tmp_path / "a.ts")
+
+
+@pytest.mark.parametrize("size", [1 << 15, 262_152])
+def test_an_image_whose_header_claims_a_huge_tile_is_refused_before_it_is_made(tmp_path, size):
+    tiled = next(f for f in (base[exr.FILE] for base in exr.bases()) if f[5] & 2)
+    place = next(entry.place for entry in exr.entries(tiled)[0] if entry.name == "tiles")
+    sides = size.to_bytes(4, "little") * 2
+    (tmp_path / "a.exr").write_bytes(tiled[:place] + sides + tiled[place + 8 :])
+    with pytest.raises(ValueError, match=r"a\.exr: the header claims \d+ MiB of pixels"):
+        read_exr(tmp_path / "a.exr")
 
 
 def test_a_run_record_of_other_types_is_named(tmp_path):

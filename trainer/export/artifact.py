@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
@@ -42,6 +43,8 @@ other libraries. Exported denoisers have none: `getattr` only with the number of
 only within the name of a class."""
 
 _UNPACKED = 20
+_DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError, OverflowError,
+            UnicodeError, struct.error, zlib.error)  # fmt: skip
 
 
 class Runtime(Protocol):
@@ -269,7 +272,7 @@ def _check_code(content: bytes, name: str) -> None:
                 data = archive.read(member)  # compares its checksum, which PyTorch does not
                 if member.endswith(".py") and (found := _FILES.search(data)):
                     raise ValueError(f"its code uses {found[0].decode()}, which Penumbra does not export")
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError, zlib.error) as error:
+    except _DAMAGED as error:
         raise ValueError(f"{name} is not a TorchScript archive, or is damaged ({error})") from error
 
 
