@@ -5,14 +5,23 @@ import torch
 from trainer.metrics.collection import METRICS, SceneMetrics
 from trainer.metrics.functional import (
     levels,
+    ms_ssim_gamma,
     psnr_afgsa,
     psnr_layer,
+    psnr_nbgd,
     psnr_wskp,
     rel_mse_half_afgsa,
     relmse_layer,
+    relmse_nbgd,
+    relmse_rousselle,
+    relmse_sbmc,
+    relmse_tungsten,
+    rmse_nbgd,
+    smape_percent_nbgd,
     smape_wskp,
     ssim_afgsa,
     ssim_layer,
+    ssim_nbgd,
     ssim_wskp,
     ssim_wskp_range1,
 )
@@ -162,6 +171,78 @@ def test_psnr_and_ssim_of_the_layer_paper_are_on_its_tone_mapped_images_with_ran
     assert ssim_layer(output, reference).numpy() == pytest.approx(similar, abs=1e-5)
     with pytest.raises(ValueError, match="11x11"):
         ssim_layer(output[..., :10, :], reference[..., :10, :])
+
+
+def stored(image):
+    """What NBGD's authors evaluate: a picture of 8 bits, rounded, read again as 0..1."""
+    return (display(image) * 255 + 0.5).astype(np.uint8) / 255
+
+
+def test_metrics_of_nbgd_are_on_stored_pictures():
+    output, reference = pair(7)
+    for i in range(len(output)):
+        x, y = stored(output[i]), stored(reference[i])
+        expected = {
+            psnr_nbgd: -10 * np.log10(np.mean((x - y) ** 2)),
+            ssim_nbgd: literal_ssim(x, y, 2.0),
+            rmse_nbgd: np.sqrt(np.mean((x - y) ** 2)),
+            smape_percent_nbgd: 100 * np.mean(2 * np.abs(x - y) / (x + y + 1e-7)),
+            relmse_nbgd: np.mean((x - y) ** 2 / (y**2 + 1e-7)),
+        }
+        for metric, value in expected.items():
+            found = float(metric(output[i : i + 1], reference[i : i + 1]))
+            assert found == pytest.approx(value, rel=1e-5), metric.__name__
+
+
+@pytest.mark.parametrize(
+    ("metric", "eps"), [(relmse_rousselle, 1e-2), (relmse_tungsten, 1e-3), (relmse_layer, 1e-4)]
+)
+def test_relative_errors_differ_by_what_keeps_black_finite(metric, eps):
+    output, reference = (image.double().numpy() for image in pair(8))
+    expected = [np.mean((o - r) ** 2 / (r**2 + eps)) for o, r in zip(output, reference, strict=True)]
+    assert metric(*pair(8)).numpy() == pytest.approx(expected, rel=1e-5)
+
+
+def test_sbmc_leaves_a_border_of_21_pixels_out():
+    output, reference = pair(9, size=(1, 3, 45, 50))
+    inner = (output[..., 21:-21, 21:-21], reference[..., 21:-21, 21:-21])
+    assert float(relmse_sbmc(output, reference)) == float(relmse_layer(*inner))
+    with pytest.raises(ValueError, match="21 pixels"):
+        relmse_sbmc(output[..., :42, :], reference[..., :42, :])
+
+
+def five_scales(x, y):
+    """Wang et al. 2003 by numpy, float64: windows as views, a Gaussian of 1.5 pixels, means of 2x2 pixels."""
+    rows, columns = np.mgrid[-5:6, -5:6]
+    weights = np.exp(-(rows**2 + columns**2) / (2 * 1.5**2))
+    weights /= weights.sum()
+
+    def windows(image):
+        return np.lib.stride_tricks.sliding_window_view(image, (11, 11), axis=(1, 2))
+
+    def mean(image):
+        return np.einsum("chwij,ij->chw", windows(image), weights)
+
+    total = 1.0
+    for scale, exponent in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+        mx, my = mean(x), mean(y)
+        vx, vy, vxy = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
+        part = (2 * vxy + 0.03**2) / (vx + vy + 0.03**2)
+        if scale == 4:
+            part = part * (2 * mx * my + 0.01**2) / (mx**2 + my**2 + 0.01**2)
+        total *= part.mean() ** exponent
+        even = [image[:, : image.shape[1] // 2 * 2, : image.shape[2] // 2 * 2] for image in (x, y)]
+        x, y = (e.reshape(3, e.shape[1] // 2, 2, e.shape[2] // 2, 2).mean((2, 4)) for e in even)
+    return total
+
+
+def test_ms_ssim_equals_a_transcription():
+    output, reference = pair(10, size=(2, 3, 180, 203))
+    pairs = zip(output, reference, strict=True)
+    expected = [five_scales(display(o), display(r)) for o, r in pairs]
+    assert ms_ssim_gamma(output, reference).numpy() == pytest.approx(expected, abs=1e-5)
+    with pytest.raises(ValueError, match="176x176"):
+        ms_ssim_gamma(output[..., :175, :], reference[..., :175, :])
 
 
 def test_levels_are_cut_off_and_not_rounded():

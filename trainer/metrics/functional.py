@@ -4,6 +4,10 @@ Every function takes linear radiance (B, 3, H, W), already multiplied by the exp
 judged, and returns one float32 number per image (B,). The transfer "gamma" of WSKP, NBGD and MR-KP is
 `clamp(max(x, 0) ** 0.454545, 0, 1)`; AFGSA and ACFM evaluate 8-bit images (`levels`); the layer paper
 `clamp(sRGB(log(1 + x)), 0, 1)` (`compressed`).
+
+Whose a metric is: wskp, Fan et al. 2021; nbgd, Meng et al. 2020 (and the multi-resolution variant that came
+with it); afgsa, Yu et al. 2021 and Xu et al. 2019; layer, Munkberg and Hasselgren 2020; sbmc, Gharbi et al.
+2019.
 """
 
 from __future__ import annotations
@@ -13,13 +17,27 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.tonemap import srgb_log
+from trainer.metrics.similarity import gaussian_parts, gaussian_similarity, uniform_similarity
 
 GAMMA = 0.454545
+
+
+_SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of MS-SSIM, the finest scale first."""
+
+SBMC_BORDER = 21
+"""Pixels on every side that SBMC's evaluation leaves out: what its network cannot see whole."""
 
 
 def gamma(radiance: Tensor) -> Tensor:
     """Return the display values in [0, 1] on which WSKP evaluates."""
     return radiance.float().clamp_min(0).pow(GAMMA).clamp_max(1)
+
+
+def gamma_8bit(radiance: Tensor) -> Tensor:
+    """Return the display values on which NBGD evaluates: WSKP's, stored in 8 bits and read again, float64."""
+    display = radiance.double().clamp_min(0).pow(GAMMA).clamp_max(1)
+    return torch.floor(display * 255 + 0.5) / 255
 
 
 def psnr_wskp(output: Tensor, reference: Tensor) -> Tensor:
@@ -38,19 +56,7 @@ def ssim_wskp(output: Tensor, reference: Tensor, data_range: float = 2.0) -> Ten
     Raises:
         ValueError: The image is smaller than the window.
     """
-    size = 7
-    _check_window(output, size)
-    x, y = gamma(output).double(), gamma(reference).double()
-    unbiased = size * size / (size * size - 1)
-
-    def mean(image: Tensor) -> Tensor:
-        return F.avg_pool2d(image, size, stride=1)
-
-    mx, my = mean(x), mean(y)
-    vx = unbiased * (mean(x * x) - mx * mx)
-    vy = unbiased * (mean(y * y) - my * my)
-    vxy = unbiased * (mean(x * y) - mx * my)
-    return _similarity(mx, my, vx, vy, vxy, data_range)
+    return uniform_similarity(gamma(output).double(), gamma(reference).double(), data_range)
 
 
 def ssim_wskp_range1(output: Tensor, reference: Tensor) -> Tensor:
@@ -58,10 +64,97 @@ def ssim_wskp_range1(output: Tensor, reference: Tensor) -> Tensor:
     return ssim_wskp(output, reference, data_range=1.0)
 
 
+def ms_ssim_gamma(output: Tensor, reference: Tensor) -> Tensor:
+    """Structural similarity over five scales of `gamma` images, range 1 (Wang et al. 2003).
+
+    The window is Gaussian, 11x11, of 1.5 pixels; only windows inside the image count; scales are halved by
+    means of 2x2 pixels. Weights and order as in the paper; negative means count as 0.
+
+    Raises:
+        ValueError: The image has less than 176 rows or columns: its last scale is smaller than the window.
+    """
+    smallest = 11 * 2 ** (len(_SCALES) - 1)
+    if min(output.shape[-2:]) < smallest:
+        raise ValueError(
+            f"MS-SSIM needs at least {smallest}x{smallest} pixels, got {tuple(output.shape[-2:])}"
+        )
+    x, y = gamma(output).double(), gamma(reference).double()
+    total = torch.ones(len(x), dtype=torch.float64)
+    for scale, weight in enumerate(_SCALES):
+        luminance, structure = gaussian_parts(x, y, 11, 1.5, 1.0)
+        last = scale == len(_SCALES) - 1
+        part = luminance * structure if last else structure
+        total = total * part.flatten(1).mean(1).clamp_min(0).pow(weight)
+        if not last:
+            x, y = F.avg_pool2d(x, 2), F.avg_pool2d(y, 2)
+    return total.float()
+
+
+def psnr_nbgd(output: Tensor, reference: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB as in NBGD: `gamma_8bit` images, peak 1; infinite where equal."""
+    error = torch.square(gamma_8bit(output) - gamma_8bit(reference)).flatten(1).mean(1)
+    return (-10 * torch.log10(error)).float()
+
+
+def ssim_nbgd(output: Tensor, reference: Tensor) -> Tensor:
+    """Structural similarity as in NBGD: `ssim_wskp`, with its data range of 2, of `gamma_8bit` images.
+
+    Raises:
+        ValueError: The image is smaller than the window.
+    """
+    return uniform_similarity(gamma_8bit(output), gamma_8bit(reference), 2.0)
+
+
+def rmse_nbgd(output: Tensor, reference: Tensor) -> Tensor:
+    """Root of the mean squared difference of `gamma_8bit` images."""
+    error = torch.square(gamma_8bit(output) - gamma_8bit(reference)).flatten(1).mean(1)
+    return error.sqrt().float()
+
+
+def smape_percent_nbgd(output: Tensor, reference: Tensor) -> Tensor:
+    """NBGD's `100 mean 2 |o - r| / (|o| + |r| + 1e-7)` of `gamma_8bit` images, between 0 and 200.
+
+    Twice WSKP's scale, in percent, and of display values where WSKP's is of radiance.
+    """
+    x, y = gamma_8bit(output), gamma_8bit(reference)
+    return (200 * (x - y).abs() / (x.abs() + y.abs() + 1e-7)).flatten(1).mean(1).float()
+
+
+def relmse_nbgd(output: Tensor, reference: Tensor) -> Tensor:
+    """NBGD's `mean (o - r)^2 / (r^2 + 1e-7)` of `gamma_8bit` images; black pixels dominate it."""
+    x, y = gamma_8bit(output), gamma_8bit(reference)
+    return (torch.square(x - y) / (torch.square(y) + 1e-7)).flatten(1).mean(1).float()
+
+
+def relmse_sbmc(output: Tensor, reference: Tensor) -> Tensor:
+    """SBMC's `mean (o - r)^2 / (r^2 + 1e-4)` without a border of 21 pixels.
+
+    Raises:
+        ValueError: Nothing is left of the image.
+    """
+    border = SBMC_BORDER
+    if min(output.shape[-2:]) <= 2 * border:
+        raise ValueError(
+            f"relmse_sbmc leaves out {border} pixels on every side of {tuple(output.shape[-2:])}"
+        )
+    inner = (..., slice(border, -border), slice(border, -border))
+    return relmse_layer(output[inner], reference[inner])
+
+
+def relmse_rousselle(output: Tensor, reference: Tensor, eps: float = 0.01) -> Tensor:
+    """Relative mean squared error `mean (o - r)^2 / (r^2 + 0.01)` of Rousselle et al. 2011 and after them."""
+    output, reference = output.float(), reference.float()
+    return (torch.square(output - reference) / (torch.square(reference) + eps)).flatten(1).mean(1)
+
+
+def relmse_tungsten(output: Tensor, reference: Tensor) -> Tensor:
+    """Relative mean squared error `mean (o - r)^2 / (r^2 + 0.001)`, of the program that NFOR came with."""
+    return relmse_rousselle(output, reference, eps=1e-3)
+
+
 def relmse_layer(output: Tensor, reference: Tensor) -> Tensor:
     """Relative mean squared error of the layer paper and SBMC, `mean (o - r)^2 / (r^2 + 1e-4)`."""
-    output, reference = output.float(), reference.float()
-    return (torch.square(output - reference) / (torch.square(reference) + 1e-4)).flatten(1).mean(1)
+    return relmse_rousselle(output, reference, eps=1e-4)
 
 
 def smape_wskp(output: Tensor, reference: Tensor) -> Tensor:
@@ -76,9 +169,7 @@ def rel_mse_half_afgsa(output: Tensor, reference: Tensor, eps: float = 0.01) -> 
 
     Neither the half nor eps is in the papers; both are in the authors' code. Tables show it times 1000.
     """
-    output, reference = output.float(), reference.float()
-    relative = torch.square(output - reference) / (torch.square(reference) + eps)
-    return 0.5 * relative.flatten(1).mean(1)
+    return 0.5 * relmse_rousselle(output, reference, eps)
 
 
 def levels(radiance: Tensor, exponent: float = 2.2, peak: int = 255) -> Tensor:
@@ -125,10 +216,7 @@ def ssim_afgsa(
     Raises:
         ValueError: The image is smaller than the window.
     """
-    _check_window(output, size)
-    return _gaussian_similarity(
-        levels(output, exponent), levels(reference, exponent), size, sigma, data_range
-    )
+    return gaussian_similarity(levels(output, exponent), levels(reference, exponent), size, sigma, data_range)
 
 
 def compressed(radiance: Tensor) -> Tensor:
@@ -159,36 +247,4 @@ def ssim_layer(output: Tensor, reference: Tensor, size: int = 11, sigma: float =
     Raises:
         ValueError: The image is smaller than the window.
     """
-    _check_window(output, size)
-    return _gaussian_similarity(compressed(output), compressed(reference), size, sigma, 1.0)
-
-
-def _gaussian_similarity(x: Tensor, y: Tensor, size: int, sigma: float, data_range: float) -> Tensor:
-    """Return the mean similarity per image under a Gaussian window, with biased variances."""
-    offsets = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    weights = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
-    weights = weights / weights.sum()
-    maps = torch.stack([x, y, x * x, y * y, x * y])
-    mx, my, mxx, myy, mxy = _weighted(_weighted(maps, weights.tolist(), -1), weights.tolist(), -2)
-    return _similarity(mx, my, mxx - mx * mx, myy - my * my, mxy - mx * my, data_range)
-
-
-def _weighted(maps: Tensor, weights: list[float], axis: int) -> Tensor:
-    """Return weighted sums of successive rows or columns; no convolution, which autocast would round."""
-    length = maps.shape[axis] - len(weights) + 1
-    total = maps.narrow(axis, 0, length) * weights[0]
-    for place, weight in enumerate(weights[1:], 1):
-        total.add_(maps.narrow(axis, place, length), alpha=weight)
-    return total
-
-
-def _check_window(image: Tensor, size: int) -> None:
-    if min(image.shape[-2:]) < size:
-        raise ValueError(f"SSIM needs at least {size}x{size} pixels, got {tuple(image.shape[-2:])}")
-
-
-def _similarity(mx: Tensor, my: Tensor, vx: Tensor, vy: Tensor, vxy: Tensor, data_range: float) -> Tensor:
-    """Return the mean similarity per image from windows' means, variances and covariance."""
-    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
-    similarity = ((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return similarity.flatten(1).mean(1).float()
+    return gaussian_similarity(compressed(output), compressed(reference), size, sigma, 1.0)
