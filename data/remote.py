@@ -159,7 +159,9 @@ def read_range(url: str, start: int, size: int) -> bytes | None:
 
 
 def send(path: Path, url: str, *, report: Callable[[int], None] | None = None) -> None:
-    """Upload a file; on S3 it appears whole or not at all, and its checksum is kept beside it.
+    """Upload a file; on S3 and in a folder it appears whole or not at all.
+
+    On S3 its checksum is kept beside it.
 
     Args:
         path: What.
@@ -176,12 +178,15 @@ def send(path: Path, url: str, *, report: Callable[[int], None] | None = None) -
         options["Metadata"] = {SHA256: digest}
     elif is_http(url):
         options["method"] = "put"
+    target = f"{url}.{os.getpid()}-{threading.get_ident()}.partial" if url.startswith("file:") else url
 
     def attempt() -> None:
         system = system_of(url)
         if not options:
             system.makedirs(system._parent(inner(url)), exist_ok=True)
-        system.put_file(str(path), inner(url), callback=counter(None, report), **options)
+        system.put_file(str(path), inner(target), callback=counter(None, report), **options)
+        if target != url:
+            system.mv(inner(target), inner(url))
         there = _size(url)
         if there != size:
             raise ContentError(f"{size} bytes were sent and {there} are there")

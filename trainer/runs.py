@@ -181,8 +181,19 @@ def begin_launch(folder: Path, launch: Launch, checkpoint: str | None = None) ->
         checkpoint: What it starts from.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    start = {"checkpoint": checkpoint, "last": _stamp(folder)}
+    start = {"attempt": attempt_of(folder) + 1, "checkpoint": checkpoint, "last": _stamp(folder)}
     _write(folder / LAUNCH_FILE, {"launch": launch.identity, "finished": False, **start})
+
+
+def noted_launch(folder: Path) -> dict[str, object]:
+    """Return what `begin_launch` and `end_launch` noted of a run, nothing where that is absent or damaged."""
+    return _read(folder / LAUNCH_FILE)
+
+
+def attempt_of(folder: Path) -> int:
+    """Return how often a run was begun or continued by launches, 0 where none is noted."""
+    number = noted_launch(folder).get("attempt")
+    return number if isinstance(number, int) else 0
 
 
 def checkpoint_of_launch(folder: Path) -> Path | None:
@@ -190,7 +201,7 @@ def checkpoint_of_launch(folder: Path) -> Path | None:
 
     None where it started from nothing and has saved none.
     """
-    noted = _read(folder / LAUNCH_FILE)
+    noted = noted_launch(folder)
     if _stamp(folder) not in (None, noted.get("last")):
         return _last(folder)
     start = noted.get("checkpoint")
@@ -219,7 +230,7 @@ def run_of_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
     if not (launch.restarts or launch.unfinished):
         return None
     for folder in reversed(run_folders(root, experiment)):
-        noted = _read(folder / LAUNCH_FILE)
+        noted = noted_launch(folder)
         if noted.get("launch") == launch.identity and not noted.get("finished"):
             return folder
     return None

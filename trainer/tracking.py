@@ -83,6 +83,7 @@ class MLflowTracking(Logger):
         self._sender: Sender | None = None
         self._sampler: Sampler | None = None
         self._lock = threading.Lock()
+        self._limit: int | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MLflowTracking:
         """Return the logger itself: a copied module, such as one of averaged weights, has the same run."""
@@ -242,6 +243,16 @@ class MLflowTracking(Logger):
                 f"cannot write {self._journal.path}: the disk is full; continue with --ckpt_path last"
             )
 
+    def deliver_up_to(self, offset: int | None) -> None:
+        """Keep from the store what lies behind an offset in bytes of the journal; None: nothing.
+
+        For what mirrors a run: where the run goes on from a mirror that lacks what the store has, that would
+        be recorded again, with other times, and be in the store twice.
+        """
+        self._limit = offset
+        if self._sender is not None:
+            self._sender.deliver_up_to(offset)
+
     def flush(self, wait_s: float | None = None) -> int:
         """Wait until the store has everything; returns the number of events that it does not have.
 
@@ -297,6 +308,7 @@ class MLflowTracking(Logger):
         quiet_mlflow(retries=0)
         load_mlflow(uri)
         self._sender = Sender(folder, self._journal)
+        self._sender.deliver_up_to(self._limit)
         self._sender.start()
         atexit.register(self._close)
         if self.system_metrics:

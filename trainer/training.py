@@ -18,6 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from models.denoiser import Denoiser
 from trainer import configs, runs
+from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.recorder import RunRecorder
 from trainer.elastic import join_ranks
 from trainer.tracking import MLflowTracking
@@ -226,6 +227,15 @@ class TrainingCLI(LightningCLI):
             place = f"from {newest}" if config.ckpt_path else "from its beginning, it has no checkpoint yet"
             print(f"restarted: the run {folder.name} goes on {place}", file=sys.stderr)
         return True
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Run the verb, and mirror its end, of which no hook of a callback hears."""
+        try:
+            super()._run_subcommand(subcommand)
+        finally:
+            for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+                if isinstance(callback, MirrorRun):
+                    callback.finish()
 
     def before_fit(self) -> None:
         """Note in the run's folder which launch trains it."""

@@ -4,7 +4,13 @@
     STORAGE/<experiment>/<run name>/mirror.json   names of what is there
     STORAGE/launches/<launch>.json                which run a launch trains, so that a restart finds it
 
-Every file is sent whole or not at all, the newest wins, and `last.ckpt` goes last.
+Every file is sent whole or not at all, and the newest wins. Of one moment, files are copied in the order
+
+    checkpoints, how far the tracking store has the journal, the journal, the files that it names
+
+and sent in the order: run and launch, files, journal, how far the store has it, checkpoints. So the mirror,
+whenever its sender dies, has a journal that knows all steps of its checkpoint and all that the store has, and
+every file that the journal names.
 """
 
 from __future__ import annotations
@@ -17,19 +23,28 @@ import re
 import shutil
 import sys
 import tempfile
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from data.remote import exists, fetch, is_url, join, read_bytes, send
 from data.shards.prepare import cache_folder
 from trainer import runs
-from trainer.cluster.restoring import kept_files, step_of
+from trainer.cluster.restoring import CHECKPOINTS, NOTHING, kept_files, reached, whole_last
+from trainer.spool.journal import SPOOL
 
 LIST = "mirror.json"
 LIST_LIMIT = 1 << 20
 """Bytes of a list of files, at most."""
 
 FIRST = (runs.RUN_FILE, runs.LAUNCH_FILE)
+LAST = "checkpoints/last.ckpt"
+JOURNAL = f"{SPOOL}/journal.jsonl"
+SENT = f"{SPOOL}/sent.json"
+SETTLE_S = 0.3
+"""Seconds between the copies of a checkpoint and of the journal: the numbers of the step after which a
+checkpoint is saved are recorded just after that."""
 
 
 def storage_url(storage: str) -> str:
@@ -49,46 +64,73 @@ def send_run(folder: Path, storage: str, sent: dict[str, tuple[int, int]], every
         folder: The run.
         storage: URL of the storage.
         sent: Size and time of what was sent before, by name; is brought up to date.
-        everything: Journals and configurations too, not only checkpoints.
+        everything: Journals and configurations too where there is no new checkpoint.
 
     Raises:
         OSError: The storage cannot be written.
     """
-    place = run_url(folder, storage)
-    changed = []
-    for name, path in kept_files(folder).items():
-        if not everything and not name.endswith(".ckpt") and name in sent:
-            continue
-        with contextlib.suppress(FileNotFoundError):  # replaced or removed this moment
-            now = path.stat()
-            if sent.get(name) != (now.st_size, now.st_mtime_ns):
-                changed.append(name)
-    if not changed:
-        return
-    for name in sorted(changed, key=lambda name: (name == "checkpoints/last.ckpt", name not in FIRST, name)):
-        with tempfile.TemporaryDirectory(prefix="penumbra-mirror-") as scratch:
-            held = _hold(folder / name, Path(scratch) / "file")
-            if held is not None:
-                send(Path(scratch) / "file", join(place, name))
-                sent[name] = held
-    _send_json(join(place, LIST), {"files": sorted(sent)})
-    if (folder / runs.LAUNCH_FILE).is_file():
-        launch = json.loads((folder / runs.LAUNCH_FILE).read_text())
-        run = {"experiment": folder.parent.name, "name": folder.name, "finished": launch["finished"]}
-        _send_json(_launch_url(storage, launch["launch"]), run)
+    scratch = folder / ".mirror"
+    shutil.rmtree(scratch, ignore_errors=True)
+    try:
+        held = _hold_changed(folder, scratch, sent, everything)
+        for name in sorted(held, key=_rank):
+            send(scratch / name, join(run_url(folder, storage), name))
+            sent[name] = held[name]
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    if held:
+        _send_json(join(run_url(folder, storage), LIST), {"files": sorted(sent)})
+        launch = runs.noted_launch(folder)
+        if launch:
+            run = {"experiment": folder.parent.name, "name": folder.name, "finished": launch.get("finished")}
+            _send_json(_launch_url(storage, str(launch.get("launch"))), run)
 
 
-def fetch_run(storage: str, launch: str, root: Path, newer_than: int = -1) -> Path | None:
+def _rank(name: str) -> tuple[int, str]:
+    """Return the place of a file in the order in which a run is sent."""
+    late = (JOURNAL, SENT, LAST)
+    if name in late:
+        return (2, 3, 5)[late.index(name)], name
+    return 4 if name.endswith(".ckpt") else int(name not in FIRST), name
+
+
+def _hold_changed(
+    folder: Path, scratch: Path, sent: dict[str, tuple[int, int]], everything: bool
+) -> dict[str, tuple[int, int]]:
+    """Copy the changed files of a run as they are at one moment; returns size and time of each."""
+    held: dict[str, tuple[int, int]] = {}
+
+    def hold(names: Iterable[str]) -> None:
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):  # replaced or removed this moment
+                now = (folder / name).stat()
+                if sent.get(name) != (now.st_size, now.st_mtime_ns):
+                    held[name] = _hold(folder / name, scratch / name)
+
+    if not (folder / runs.RUN_FILE).is_file():
+        return held
+    hold(kept_files(folder, CHECKPOINTS))
+    if held:
+        time.sleep(SETTLE_S)
+    elif not everything:
+        return held
+    rest = [name for name in kept_files(folder) if not name.endswith(".ckpt")]
+    hold(sorted(rest, key=JOURNAL.__eq__))  # last
+    hold(name for name in kept_files(folder, (f"{SPOOL}/files/**/*",)) if name not in held)
+    return held
+
+
+def fetch_run(storage: str, launch: str, root: Path, newer_than: tuple[int, int] = NOTHING) -> Path | None:
     """Bring the run of a launch from a storage to this machine.
 
     Args:
         storage: Folder or URL.
         launch: Identity of the launch.
         root: Folder of all runs.
-        newer_than: Step that this machine has already; only a later one replaces it.
+        newer_than: What this machine's run has `reached`; only one that is further replaces it.
 
     Returns:
-        The run's folder; None where the storage has no such run, a finished one, or no newer checkpoint.
+        The run's folder; None where the storage has no such run, a finished one, or none that is further.
 
     Raises:
         OSError: The storage cannot be read.
@@ -109,8 +151,8 @@ def fetch_run(storage: str, launch: str, root: Path, newer_than: int = -1) -> Pa
     return folder
 
 
-def bring_run(place: str, folder: Path, newer_than: int = -1) -> bool:
-    """Bring a mirrored run into a folder; returns whether its last checkpoint is later than a given step.
+def bring_run(place: str, folder: Path, newer_than: tuple[int, int] = NOTHING) -> bool:
+    """Bring a mirrored run into a folder; returns whether it has `reached` more than what is given.
 
     Raises:
         OSError: The storage cannot be read.
@@ -125,9 +167,9 @@ def bring_run(place: str, folder: Path, newer_than: int = -1) -> bool:
         for entry in names:
             (scratch / entry).parent.mkdir(parents=True, exist_ok=True)
             fetch(join(place, entry), scratch / entry)
-        if step_of(scratch) <= newer_than:
+        if reached(scratch) <= newer_than:
             return False
-        for entry in sorted(names, key=lambda entry: entry == runs.RUN_FILE):
+        for entry in whole_last(names):
             (folder / entry).parent.mkdir(parents=True, exist_ok=True)
             os.replace(scratch / entry, folder / entry)
     finally:
@@ -149,12 +191,12 @@ def fetch_checkpoint(url: str, root: Path) -> Path:
         ValueError: It is damaged.
     """
     url = url.rstrip("/")
-    place, name = (url, "checkpoints/last.ckpt") if not url.endswith(".ckpt") else _split(url)
+    place, name = (url, LAST) if not url.endswith(".ckpt") else _split(url)
     if place and exists(join(place, LIST)):
         experiment, run = place.split("/")[-2:]
         folder = root / experiment / run
         if _plain(experiment) and _plain(run):
-            bring_run(place, folder, step_of(folder if folder.is_dir() else None))
+            bring_run(place, folder, reached(folder if folder.is_dir() else None))
             return folder / name
     key = hashlib.sha256(url.encode()).hexdigest()[:16]
     path = cache_folder() / "checkpoints" / key / name.rpartition("/")[2]
@@ -170,21 +212,19 @@ def _split(url: str) -> tuple[str, str]:
     return (run, f"checkpoints/{file}") if parent == "checkpoints" else ("", file)
 
 
-def _hold(path: Path, held: Path) -> tuple[int, int] | None:
-    """Copy a file as it is now, for nothing where its kind is replaced and not appended to; None: it is gone.
+def _hold(path: Path, held: Path) -> tuple[int, int]:
+    """Copy a file as it is now, for nothing where its kind is replaced and not appended to.
 
     Returns:
         Size and time of what was held.
     """
-    try:
-        if path.suffix == ".ckpt":
-            with contextlib.suppress(OSError):  # another disk
-                os.link(path, held)
-        if not held.exists():
-            shutil.copy2(path, held)
-        state = held.stat()
-    except FileNotFoundError:
-        return None
+    held.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix != ".jsonl":
+        with contextlib.suppress(OSError):  # a file system without links
+            os.link(path, held)
+    if not held.exists():
+        shutil.copy2(path, held)
+    state = held.stat()
     return state.st_size, state.st_mtime_ns
 
 

@@ -8,6 +8,7 @@ import os
 import re
 import socket
 import sys
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from trainer.commands.denoise import size_in_bytes
 
 if TYPE_CHECKING:
     from trainer.loading import Loaded
+    from trainer.serving.batching import Batching
     from trainer.serving.limits import Limits
 
 HELP = "denoise over HTTP"
@@ -49,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest frame, with up to 32 channels; with more channels less (default: 10)")  # fmt: skip
     add("--max-upload-mb", type=_positive, default=256.0, metavar="N",
         help="largest upload in MB (default: 256)")  # fmt: skip
+    add("--disk", type=size_in_bytes, default=size_in_bytes("2GB"), metavar="SIZE",
+        help="room in the temporary folder (TMPDIR) for all requests together: uploads, what ZIP files "
+        "unpack to, results (default: 2GB)")  # fmt: skip
     add("--max-frames", type=_whole(1, 100_000), default=64, metavar="N",
         help="frames of a ZIP file (default: 64)")  # fmt: skip
     add("--queue", type=_whole(0, 10_000), default=16, metavar="N",
@@ -96,7 +101,9 @@ def run(args: argparse.Namespace) -> int:
         settings = Settings(memory=args.memory, device=args.device, tile=args.tile)
         pixels = CPU_PIXELS if args.device == "cpu" else None
         batching = Batching(args.batch, args.memory, pixels, args.threads)
-        service = Service(loaded, settings, _limits(args), batching, token)
+        limits = _limits(args)
+        service = Service(loaded, settings, limits, batching, token)
+        _warn(limits, batching)
         _announce(args, listening, loaded, token)
         level = "warning" if args.quiet else "info"
         make_server(service, access_log=not args.quiet, log_level=level).run(sockets=[listening])
@@ -109,11 +116,20 @@ def _limits(args: argparse.Namespace) -> Limits:
     return Limits(
         megapixels=args.max_megapixels,
         upload=int(args.max_upload_mb * 1e6),
+        disk=args.disk,
         frames=args.max_frames,
         queue=args.queue,
         read=args.upload_timeout,
         compute=args.timeout,
     )
+
+
+def _warn(limits: Limits, batching: Batching) -> None:
+    """Say where requests may take more than there is."""
+    from trainer.serving.memory import shortages
+
+    for text in shortages(limits, batching, Path(tempfile.gettempdir())):
+        print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 def _model(args: argparse.Namespace) -> Loaded:

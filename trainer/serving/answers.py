@@ -14,9 +14,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from trainer.serving.limits import Refusal
 from trainer.serving.metrics import Metrics
+from trainer.serving.room import RETRY
 from trainer.serving.work import Done
 
 PATHS = ("/", "/health", "/metrics", "/docs", "/openapi.json", "/denoise")
+
+ALWAYS = ("/health", "/metrics")
+"""Paths that are answered however busy the service is."""
 
 _PIECE = 1 << 18
 _LINGER = 2.0
@@ -25,10 +29,16 @@ _MAX_HEADER = 2000
 
 
 class Problem(JSONResponse):
-    """An error. What a client still sends is read and dropped for a moment, so that it sees the answer."""
+    """An error. What a client still sends is read and dropped for a moment, so that it sees the answer.
 
-    def __init__(self, refusal: Refusal) -> None:
+    Args:
+        refusal: What is answered.
+        linger: Seconds of that moment.
+    """
+
+    def __init__(self, refusal: Refusal, linger: float = _LINGER) -> None:
         super().__init__({"detail": refusal.detail}, refusal.status, refusal.headers)
+        self.linger = linger
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it."""
@@ -39,7 +49,7 @@ class Problem(JSONResponse):
         await send({"type": "http.response.start", "status": self.status_code, "headers": headers})
         await send({"type": "http.response.body", "body": self.body, "more_body": True})
         with suppress(TimeoutError):
-            async with asyncio.timeout(_LINGER):
+            async with asyncio.timeout(self.linger):
                 while not scope.get(_READ) and (await receive())["type"] != "http.disconnect":
                     pass
         await send({"type": "http.response.body", "body": b""})
@@ -85,13 +95,16 @@ async def _pieces(path: Path) -> AsyncIterator[bytes]:
 class Counting:
     """Counts answers, marks requests whose body was read to its end, and forbids browsers to guess types.
 
+    Where there are too many connections it refuses everything but what tells how the service is.
+
     Args:
         app: The application.
         metrics: Where answers are counted.
+        crowded: Returns whether there are too many connections.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self.app, self.metrics = app, metrics
+    def __init__(self, app: ASGIApp, metrics: Metrics, crowded: Callable[[], bool]) -> None:
+        self.app, self.metrics, self.crowded = app, metrics, crowded
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on."""
@@ -113,7 +126,12 @@ class Counting:
                 message = {**message, "headers": [*message.get("headers", []), *extra]}
             await send(message)
 
-        await self.app(scope, received, sent)
+        refused = self.crowded() and scope["path"] not in ALWAYS
+        await (Problem(_crowded(), linger=0.0) if refused else self.app)(scope, received, sent)
+
+
+def _crowded() -> Refusal:
+    return Refusal(503, "too many connections are open; try again in 5 s", dict(RETRY))
 
 
 def described(

@@ -55,7 +55,7 @@ def create_app(service: Service) -> FastAPI:
         lifespan=life,
         redoc_url=None,
     )
-    app.add_middleware(Counting, metrics=service.metrics)
+    app.add_middleware(Counting, metrics=service.metrics, crowded=lambda: service.crowded())
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(Refusal, _refused)
     _add_pages(app, service)
@@ -189,11 +189,19 @@ def _answers(service: Service) -> dict[int | str, dict[str, Any]]:
         **described(
             408, f"The body came too slowly: {limits.read:g} s, or {limits.idle:g} s without a byte."
         ),
-        **described(413, f"The body has more than {limits.upload / 1e6:g} MB."),
+        **described(
+            413,
+            f"The body has more than {limits.upload / 1e6:g} MB, or takes more than {limits.disk / 1e6:g} MB "
+            "with what it unpacks to and its results.",
+        ),
         **described(415, "The media type is none of those listed, or the body is compressed."),
         **described(422, "The file cannot be denoised, or an option is wrong; the text says why."),
         **described(500, "The server failed; its log says why."),
-        **described(503, "Too many requests wait, or the server is ending.", retry),
+        **described(
+            503,
+            "Too many requests wait, their files take all room, or the server is ending or has failed.",
+            retry,
+        ),
         **described(504, f"The result took longer than {limits.compute:g} s."),
     }
 

@@ -5,10 +5,13 @@ This runs where memory is limited (`reader`), since a directory of millions of n
 
 from __future__ import annotations
 
+import errno
 import stat
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from trainer.serving.limits import Limits
@@ -22,6 +25,19 @@ _ENCRYPTED = 0x1
 _BESIDE = ("__MACOSX", ".DS_Store")
 
 
+def is_zip(path: Path) -> bool:
+    """Return whether a file begins as ZIP files do."""
+    with path.open("rb") as file:
+        return file.read(2) == b"PK"
+
+
+def unpacked_size(path: Path, limits: Limits) -> int:
+    """Return the bytes that `unpack` will write, at most; raises as it does."""
+    with _opened(path) as archive:
+        members, _ = _members(archive, limits)
+    return sum(info.file_size for info in members)
+
+
 def unpack(path: Path, folder: Path, limits: Limits) -> list[str]:
     """Unpack the EXR files of a ZIP file into a folder, without the folders in it, and return their names.
 
@@ -29,24 +45,47 @@ def unpack(path: Path, folder: Path, limits: Limits) -> list[str]:
         ValueError: It is damaged or encrypted, too large or too many, or holds what is no EXR file by name;
             nothing was written where the directory already tells.
     """
+    with _opened(path) as archive:
+        members, names = _members(archive, limits)
+        for info, name in zip(members, names, strict=True):
+            _extract(archive, info, folder / name)
+    return names
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open a ZIP file; what `zipfile` raises for a damaged one becomes a ValueError."""
+    damaged = (
+        zipfile.BadZipFile,  # records that contradict each other, a wrong checksum
+        zlib.error,  # packed bytes that are none
+        EOFError,  # packed bytes that end too early
+        NotImplementedError,  # a version or a way of packing that is not known, patches
+        struct.error,  # a local header that is cut off
+        UnicodeDecodeError,  # a name that is no UTF-8, though it claims to be
+    )
     try:
         with zipfile.ZipFile(path) as archive:
-            members = [info for info in archive.infolist() if not _passed_over(info)]
-            names = _checked(members, limits)
-            left = limits.unpacked
-            for info, name in zip(members, names, strict=True):
-                left -= _extract(archive, info, folder / name, left)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, KeyError) as error:
+            yield archive
+    except damaged as error:
         raise ValueError(f"{path.name}: damaged or unusual ZIP file ({error}); pack it again") from None
-    except (UnicodeError, OverflowError, struct.error) as error:
-        raise ValueError(f"{path.name}: damaged ZIP file ({type(error).__name__}); pack it again") from None
-    return names
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        raise ValueError(
+            f"{path.name}: damaged ZIP file (a place before its start or after its end)"
+        ) from None
+
+
+def _members(archive: zipfile.ZipFile, limits: Limits) -> tuple[list[zipfile.ZipInfo], list[str]]:
+    """Return the members that are unpacked, and under which names."""
+    members = [info for info in archive.infolist() if not _passed_over(info)]
+    return members, _checked(members, limits)
 
 
 def _passed_over(info: zipfile.ZipInfo) -> bool:
     """Tell folders, and what some systems add to every archive."""
     parts = PurePosixPath(info.filename).parts
-    return info.is_dir() or (bool(parts) and (parts[0] in _BESIDE or parts[-1] in _BESIDE))
+    return info.filename.endswith("/") or (bool(parts) and (parts[0] in _BESIDE or parts[-1] in _BESIDE))
 
 
 def _checked(members: list[zipfile.ZipInfo], limits: Limits) -> list[str]:
@@ -95,13 +134,12 @@ def plain_name(name: str) -> str:
     return f"{kept.lstrip('.')[-90:] or 'frame'}.exr"
 
 
-def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, left: int) -> int:
-    """Write a member and return its size, whatever the directory says that it is."""
+def _extract(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path) -> None:
+    """Write a member, though no more than the directory says that it has."""
     size = 0
     with archive.open(info) as source, target.open("xb") as sink:
         while chunk := source.read(_CHUNK):
             size += len(chunk)
-            if size > min(left, info.file_size):
+            if size > info.file_size:
                 raise ValueError(f"{target.name} in the ZIP file is larger than its directory says")
             sink.write(chunk)
-    return size

@@ -7,6 +7,7 @@ influences another (every denoiser is tested for it), so a result is that of the
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -30,8 +31,14 @@ CPU_PIXELS = 1 << 16
 _LOOK = 5.0
 """Seconds after which who waits for a tile looks whether the model's thread is still there."""
 
+_LOG = logging.getLogger("penumbra.serve")
+
 Told = Callable[[int, float], None]
 """Told the tiles of a batch and their megapixels."""
+
+
+class Failed(Exception):  # noqa: N818  # a state, which the log explains
+    """The model's thread has ended though nobody asked it to: the service has to be started again."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +97,7 @@ class Batcher:
         self.batching, self.told = batching, told
         self._waiting: deque[_Tile] = deque()
         self._changed = threading.Condition()
-        self._closed = False
+        self._closed = self._asked = False
         self._thread = threading.Thread(target=self._work, name="model", daemon=True)
         self._thread.start()
 
@@ -104,37 +111,45 @@ class Batcher:
 
         Raises:
             Over: Nobody waits for the result any more.
+            Failed: The model's thread has ended.
             Exception: What the method raised.
         """
         tile = _Tile(call, buffers, ticket)
         with self._changed:
             if self._closed:
-                raise Over
+                raise self._ended()
             self._waiting.append(tile)
             self._changed.notify()
         while not wait([tile.result], _LOOK).done:
             if not self.alive:
-                raise Over
+                raise self._ended()
         return tile.result.result()
 
     def close(self) -> None:
         """End the thread after the batch that it works on; who waits gets `Over`."""
         with self._changed:
-            self._closed = True
+            self._asked = self._closed = True
             self._changed.notify()
         self._thread.join()
 
+    def _ended(self) -> Exception:
+        return Over() if self._asked else Failed()
+
     def _work(self) -> None:
-        if self.batching.threads is not None:
-            torch.set_num_threads(self.batching.threads)
+        tiles: list[_Tile] = []
         try:
+            if self.batching.threads is not None:
+                torch.set_num_threads(self.batching.threads)
             while tiles := self._next():
                 self._run(tiles)
+        except Exception:
+            _LOG.exception("the thread that runs the model has ended")
         finally:
             with self._changed:
                 self._closed = True
-                for tile in self._waiting:
-                    tile.result.set_exception(Over())
+                for tile in [*tiles, *self._waiting]:
+                    if not tile.result.done():
+                        tile.result.set_exception(self._ended())
 
     def _next(self) -> list[_Tile]:
         """Wait for tiles and return those of the next batch; none when it is time to end."""

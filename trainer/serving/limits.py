@@ -19,6 +19,8 @@ class Limits:
     Attributes:
         megapixels: Largest frame, in millions of pixels, with up to 32 channels.
         upload: Bytes of a request's body.
+        disk: Bytes of the temporary folder that all requests together may take: uploads, what ZIP files unpack
+            to, results.
         frames: Frames of a ZIP file.
         queue: Requests that wait for those that run; as many again may be sending their body.
         read: Seconds that a body may take to come in.
@@ -30,6 +32,7 @@ class Limits:
 
     megapixels: float = 10.0
     upload: int = 256 * 10**6
+    disk: int = 2 * 10**9
     frames: int = 64
     queue: int = 16
     read: float = 60.0

@@ -25,7 +25,7 @@ class Metrics:
     Args:
         loaded: The model.
         queue: Returns how many requests wait.
-        deaths: Returns how many readers were replaced.
+        deaths: Returns how many readers died or hung.
     """
 
     def __init__(self, loaded: Loaded, queue: Callable[[], int], deaths: Callable[[], int]) -> None:
@@ -58,7 +58,9 @@ class Metrics:
         self.active.set(0)
         Gauge("penumbra_queue_length", "Requests that wait.", registry=registry).set_function(queue)
         Gauge(
-            "penumbra_reader_deaths", "Readers of EXR files that were replaced.", registry=registry
+            "penumbra_reader_deaths",
+            "Readers of EXR files that died or hung, and were replaced.",
+            registry=registry,
         ).set_function(deaths)
         source = loaded.source
         Info("penumbra_model", "The model.", registry=registry).info(

@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from data.exr import read_frame
-from data.exr_image import exr_extent
-from trainer.serving.archive import unpack
+from data.exr_image import COPIES, exr_extent
+from trainer.serving.archive import is_zip, unpack, unpacked_size
 from trainer.serving.limits import CHANNELS, Limits
+from trainer.serving.room import is_full
 from trainer.serving.wire import Parcel, pack
 
-COPIES = 4
-"""How many times the size of a frame its decoding may take: halves, float32, repairs, what is sent."""
+SCRATCH = 256 << 20
+"""Bytes that it may take beside its libraries and `COPIES` times the frame."""
 
-_SCRATCH = 256 << 20
 _HANDLES = 64
 
 
@@ -40,7 +40,7 @@ def main() -> int:
         try:
             parcel = _answer(json.loads(line), limits)
         except (ValueError, OSError) as error:
-            parcel = Parcel({"error": str(error)})
+            parcel = Parcel({"error": str(error), "full": is_full(error)})
         except MemoryError:
             parcel = Parcel({"error": "the file needs more memory than a frame of the largest size does"})
         _send(answers, parcel)
@@ -87,7 +87,7 @@ def _limit_memory(frame: int) -> None:
     """
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + _SCRATCH + COPIES * frame
+    most = pages * resource.getpagesize() + SCRATCH + COPIES * frame
     resource.setrlimit(
         resource.RLIMIT_AS, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard)
     )
@@ -97,6 +97,8 @@ def _answer(request: dict[str, Any], limits: Limits) -> Parcel:
     os.chdir(request["folder"])  # so that messages name the file and no folder of this machine
     name = request["name"]
     _limit_memory(0)
+    if request["what"] == "room":
+        return Parcel({"bytes": unpacked_size(Path(name), limits) if is_zip(Path(name)) else 0})
     if request["what"] == "list":
         return Parcel({"frames": _list(Path(name), limits)})
     _limit_memory(_size(Path(name), limits))
@@ -108,9 +110,7 @@ def _answer(request: dict[str, Any], limits: Limits) -> Parcel:
 
 def _list(path: Path, limits: Limits) -> list[dict[str, Any]]:
     """Return the frames of an EXR or ZIP file with the bytes that each takes; too large ones are refused."""
-    with path.open("rb") as file:
-        zipped = file.read(2) == b"PK"
-    if zipped:
+    if is_zip(path):
         (folder := Path("frames")).mkdir()
         names = [f"frames/{name}" for name in unpack(path, folder, limits)]
     else:

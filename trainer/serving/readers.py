@@ -16,7 +16,11 @@ from typing import Any
 from data.frame import Frame
 from trainer.serving.limits import Limits, Over, Refusal, Ticket
 from trainer.serving.reader import argument, command
+from trainer.serving.room import no_room
 from trainer.serving.wire import MAX_LINE, Parcel, receive, unpack
+
+READERS = 2
+"""Processes of a service."""
 
 _PATIENCE = 0.05
 _PASSED_ON = ("PATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TZ")
@@ -28,6 +32,9 @@ class Readers:
     Args:
         count: Processes.
         limits: Of a request; a process has the memory that the largest frame needs, and no more.
+
+    Attributes:
+        deaths: Processes that died or hung; not those that were ended since nobody waited any more.
     """
 
     def __init__(self, count: int, limits: Limits) -> None:
@@ -37,11 +44,16 @@ class Readers:
         for _ in range(count):
             self._idle.put(self._start())
 
+    def room(self, folder: Path, name: str, ticket: Ticket) -> int:
+        """Return the bytes that `frames` will write, at most; raises as it does."""
+        parcel = self._ask({"what": "room", "folder": str(folder), "name": name}, ticket)
+        return int(parcel.values["bytes"])
+
     def frames(self, folder: Path, name: str, ticket: Ticket) -> list[dict[str, Any]]:
         """Return `name` and `bytes` of each frame of an uploaded file, which is unpacked where it is a ZIP.
 
         Raises:
-            Refusal: The file is damaged or hostile.
+            Refusal: The file is damaged or hostile, or the disk is full.
             Over: Nobody waits for the result any more.
         """
         parcel = self._ask({"what": "list", "folder": str(folder), "name": name}, ticket)
@@ -68,6 +80,8 @@ class Readers:
     def _ask(self, request: Mapping[str, Any], ticket: Ticket) -> Parcel:
         with self._process(ticket) as process:
             parcel = process.ask(request, ticket)
+        if parcel.values.get("full"):
+            raise no_room()
         if "error" in parcel.values:
             raise Refusal(422, parcel.values["error"])
         return parcel
@@ -86,11 +100,11 @@ class Readers:
         process = self._free(ticket)
         try:
             yield process
-        except BaseException:
+        except BaseException as error:
             # It died, hangs, or is in the middle of something that nobody wants any more.
+            self.deaths += not isinstance(error, Over)
             process.end()
             self._all.discard(process)
-            self.deaths += 1
             process = self._start()
             raise
         finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import sys
 from types import FrameType
 from typing import Any
 
@@ -21,6 +22,8 @@ CLOSE_SECONDS = 10.0
 
 _LOOK = 1.0
 _MORE_CONNECTIONS = 64
+_SPARE = 64
+"""Connections beyond those at which requests are refused; on them a probe is answered."""
 
 
 class Protocol(H11Protocol):
@@ -29,10 +32,18 @@ class Protocol(H11Protocol):
     _watch: asyncio.TimerHandle | None = None
     _waiting = _closing = 0.0
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        # uvicorn would refuse probes as well; the application refuses all others.
+        self._most, self.limit_concurrency = self.config.limit_concurrency or sys.maxsize, None
+        self._made = self.loop.time()
+
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start to look after the connection."""
         super().connection_made(transport)
         self._look()
+        if len(self.connections) > self._most + _SPARE:
+            self._make_way()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop to look after it."""
@@ -42,13 +53,25 @@ class Protocol(H11Protocol):
 
     def _look(self) -> None:
         """Count the seconds without a request, and those that it takes to close."""
-        idle = self.cycle is None or self.cycle.response_complete
-        self._waiting = self._waiting + _LOOK if idle else 0.0
+        self._waiting = self._waiting + _LOOK if self._idle else 0.0
         self._closing = self._closing + _LOOK if self.transport.is_closing() else 0.0
         if self._closing > CLOSE_SECONDS or self._waiting > HEADER_SECONDS:
             self.transport.abort()
             return
         self._watch = self.loop.call_later(_LOOK, self._look)
+
+    @property
+    def _idle(self) -> bool:
+        return self.cycle is None or self.cycle.response_complete
+
+    def _make_way(self) -> None:
+        """Cut off the connection that has been without a request for longest, rather than refuse a new one."""
+        idle = [
+            c
+            for c in self.connections
+            if isinstance(c, Protocol) and c._idle and not c.transport.is_closing()
+        ]
+        max(idle, key=lambda c: (c._waiting, -c._made)).transport.abort()
 
 
 class Server(uvicorn.Server):
@@ -79,6 +102,7 @@ def make_server(service: Service, **options: Any) -> Server:
         options: More of uvicorn.
     """
     limits = service.limits
+    most = 4 * (limits.queue + service.active) + _MORE_CONNECTIONS
     config = uvicorn.Config(
         create_app(service),
         http=Protocol,
@@ -87,7 +111,9 @@ def make_server(service: Service, **options: Any) -> Server:
         server_header=False,
         timeout_graceful_shutdown=int(limits.compute + limits.send),
         timeout_keep_alive=int(HEADER_SECONDS),
-        limit_concurrency=4 * (limits.queue + service.active) + _MORE_CONNECTIONS,
+        limit_concurrency=most,
         **options,
     )
-    return Server(config, service)
+    server = Server(config, service)
+    service.crowded = lambda: len(server.server_state.connections) > most
+    return server

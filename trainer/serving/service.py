@@ -10,9 +10,9 @@ import logging
 import math
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 from starlette.requests import ClientDisconnect, Request
@@ -21,14 +21,14 @@ from starlette.responses import Response
 from trainer.denoising import Settings
 from trainer.loading import Loaded
 from trainer.serving.answers import Problem, Result
-from trainer.serving.batching import Batcher, Batching
+from trainer.serving.batching import Batcher, Batching, Failed
 from trainer.serving.limits import Limits, Over, Refusal, Ticket
 from trainer.serving.metrics import Metrics
-from trainer.serving.readers import Readers
+from trainer.serving.readers import READERS, Readers
+from trainer.serving.room import RETRY, Place, Room, is_full, no_room
 from trainer.serving.upload import check_headers, receive
-from trainer.serving.work import Done, Wish, Workshop, remove
+from trainer.serving.work import Done, Wish, Workshop
 
-READERS = 2
 _LOG = logging.getLogger("penumbra.serve")
 _GONE = 499
 _TRIM_SECONDS = 1.0
@@ -54,6 +54,7 @@ class Service:
         self.active = batching.most + 1
         self.sending = self.admitted = 0
         self.draining = False
+        self.crowded: Callable[[], bool] = lambda: False
         self.seconds = 1.0
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         self._trimmed = 0.0
@@ -66,6 +67,7 @@ class Service:
         self._threads = ThreadPoolExecutor(self.active, "request")
         self._temporary = tempfile.TemporaryDirectory(prefix="penumbra-serve-")
         self._numbers = itertools.count()
+        self.room = Room(limits.disk)
 
     def close(self) -> None:
         """End threads and processes and remove files; requests must be finished before."""
@@ -94,43 +96,51 @@ class Service:
 
     async def answer(self, request: Request, wish: Wish) -> Response:
         """Return the answer to a request; never raises for what a client did."""
-        folder = Path(self._temporary.name) / str(next(self._numbers))
+        place = Place(Path(self._temporary.name) / str(next(self._numbers)), self.room)
         try:
-            return await self._answer(request, wish, folder)
+            return await self._answer(request, wish, place)
         except Refusal as refusal:
-            remove(folder)
+            place.remove()
             return Problem(refusal)
         except ClientDisconnect:
-            remove(folder)
+            place.remove()
             self.metrics.abandoned.inc()
             return Response(status_code=_GONE)
+        except OSError as error:
+            place.remove()
+            if not is_full(error):
+                raise
+            _LOG.error("%s is full", self._temporary.name)
+            return Problem(no_room())
         except BaseException:
-            remove(folder)
+            place.remove()
             raise
 
-    async def _answer(self, request: Request, wish: Wish, folder: Path) -> Response:
-        self._room(self.admitted + self.sending)
-        check_headers(request, self.limits)
-        upload = folder / "upload"
-        upload.mkdir(parents=True)
+    async def _answer(self, request: Request, wish: Wish, place: Place) -> Response:
+        self._admit(self.admitted + self.sending)
+        length = check_headers(request, self.limits).length
+        self.room.check(length)
+        place.upload.mkdir(parents=True)
         self.sending += 1
         try:
-            name = await receive(request, upload, self.limits)
+            name = await receive(request, place, self.limits)
         finally:
             self.sending -= 1
-        self._room(self.admitted)
-        self.metrics.upload.observe((upload / name).stat().st_size)
-        done = await self._worked(request, folder, name, wish)
-        return Result(done, self.limits.send, partial(remove, folder))
+        self._admit(self.admitted)
+        self.metrics.upload.observe((place.upload / name).stat().st_size)
+        done = await self._worked(request, place, name, wish)
+        return Result(done, self.limits.send, place.remove)
 
-    def _room(self, there: int) -> None:
-        """Refuse a request for which there is no room.
+    def _admit(self, there: int) -> None:
+        """Refuse a request that cannot be worked on.
 
         Args:
             there: Requests that are before it.
         """
         if self.draining:
-            raise Refusal(503, "the server is ending; ask another one", {"Retry-After": "5"})
+            raise Refusal(503, "the server is ending; ask another one", dict(RETRY))
+        if not self.batcher.alive:
+            raise self._failed()
         if there >= self.active + self.limits.queue:
             wait = math.ceil(min(max(self.seconds * self.admitted / self.active, 1), 60))
             raise Refusal(
@@ -139,12 +149,12 @@ class Service:
                 {"Retry-After": str(wait)},
             )
 
-    async def _worked(self, request: Request, folder: Path, name: str, wish: Wish) -> Done:
+    async def _worked(self, request: Request, place: Place, name: str, wish: Wish) -> Done:
         """Have a request worked on, until it is done, its time is up or its client goes away."""
         start = time.monotonic()
         ticket = Ticket(start + self.limits.compute)
         self.admitted += 1
-        job = self._threads.submit(self._work, folder / "upload", name, wish, ticket)
+        job = self._threads.submit(self._work, place, name, wish, ticket)
         gone = asyncio.ensure_future(_gone(request))
         result = asyncio.wrap_future(job)
         result.add_done_callback(lambda future: future.cancelled() or future.exception())  # it is looked at
@@ -164,9 +174,9 @@ class Service:
         finally:
             gone.cancel()
             ticket.cancel()
-            self._finished(job, folder)
+            self._finished(job, place)
 
-    def _finished(self, job: Future[Done], folder: Path) -> None:
+    def _finished(self, job: Future[Done], place: Place) -> None:
         """Give the place of a request to another one when its thread has stopped."""
         loop = asyncio.get_running_loop()
         ended = job.done() and not job.cancelled() and job.exception() is None
@@ -175,7 +185,7 @@ class Service:
             self.admitted -= 1
             self._give_back()
             if not ended:
-                remove(folder)
+                place.remove()
 
         if job.done() or job.cancel():
             free()
@@ -194,7 +204,11 @@ class Service:
             raise
         except Over:
             raise self._late() from None
-        except Exception:
+        except Failed:
+            raise self._failed() from None
+        except Exception as error:
+            if is_full(error):
+                raise no_room() from error
             _LOG.exception("a request failed")
             raise Refusal(500, "the server failed on this request; its log says why") from None
 
@@ -203,10 +217,17 @@ class Service:
             504, f"the result took longer than {self.limits.compute:g} seconds; send smaller or fewer frames"
         )
 
-    def _work(self, folder: Path, name: str, wish: Wish, ticket: Ticket) -> Done:
+    def _failed(self) -> Refusal:
+        return Refusal(
+            503,
+            "the server cannot run its model any more and has to be started again; its log says why",
+            dict(RETRY),
+        )
+
+    def _work(self, place: Place, name: str, wish: Wish, ticket: Ticket) -> Done:
         with self.metrics.active.track_inprogress():
             ticket.check()
-            done = self.workshop.work(folder, name, wish, ticket)
+            done = self.workshop.work(place, name, wish, ticket)
             self.metrics.megapixels.inc(done.pixels / 1e6)
             return done
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from email.message import Message
-from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
@@ -14,6 +13,7 @@ from starlette.requests import Request
 
 from trainer.serving.archive import plain_name
 from trainer.serving.limits import Limits, Refusal
+from trainer.serving.room import Place
 
 RAW = (
     "image/x-exr",
@@ -29,34 +29,46 @@ _MAX_PARTS = 16
 _MAX_BOUNDARY = 200
 
 
-async def receive(request: Request, folder: Path, limits: Limits) -> str:
-    """Write the file that a request brings into a folder and return its name there.
+class Announced(NamedTuple):
+    """What the headers of a request say: media type, boundary of a form, bytes (0 where they do not say)."""
+
+    kind: str
+    boundary: str
+    length: int
+
+
+async def receive(request: Request, place: Place, limits: Limits) -> str:
+    """Write the file that a request brings into its folder for uploads and return its name there.
 
     Args:
         request: Whose body is an EXR or ZIP file, or a form with one in the field `file`.
-        folder: An empty one.
+        place: Of the request.
         limits: Of a request.
 
     Raises:
-        Refusal: 400 a malformed form, 408 too slow, 413 too large, 415 another type, 422 nothing in it.
+        Refusal: 400 a malformed form, 408 too slow, 413 too large, 415 another type, 422 nothing in it, 503 no
+            room.
         ClientDisconnect: The client went away.
+        OSError: The file cannot be written.
     """
-    kind, boundary = check_headers(request, limits)
-    with (folder / "body").open("wb") as file:
+    kind, boundary, _ = check_headers(request, limits)
+    body = place.upload / "body"
+    with body.open("wb") as file:
         sink = _Form(file, boundary) if kind == FORM else _Raw(file)
         size = 0
         async for piece in _paced(request.stream(), limits):
             size += len(piece)
             if size > limits.upload:
                 raise too_large(limits)
+            place.take(len(piece))
             sink.write(piece)
         name = sink.finish()
-    (folder / "body").rename(folder / name)
+    body.rename(place.upload / name)
     return name
 
 
-def check_headers(request: Request, limits: Limits) -> tuple[str, str]:
-    """Return the media type and, of a form, its boundary; raises as `receive`, before a byte is read."""
+def check_headers(request: Request, limits: Limits) -> Announced:
+    """Return what the headers say; raises as `receive`, before a byte is read."""
     header = Message()
     header["content-type"] = request.headers.get("content-type", "")
     kind = header.get_content_type() if request.headers.get("content-type") else ""
@@ -68,15 +80,16 @@ def check_headers(request: Request, limits: Limits) -> tuple[str, str]:
         )
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise Refusal(415, "Content-Encoding: expected none; EXR and ZIP files are compressed already")
-    length = request.headers.get("content-length", "")
-    if length.isascii() and length.isdigit() and (len(length) > 15 or int(length) > limits.upload):
+    text = request.headers.get("content-length", "")
+    length = int(text[:16]) if text.isascii() and text.isdigit() else 0
+    if length > limits.upload:
         raise too_large(limits)
     boundary = str(header.get_param("boundary") or "")
     if kind == FORM and not 0 < len(boundary) <= _MAX_BOUNDARY:
         raise Refusal(
             400, "the form has no boundary in its Content-Type; expected multipart/form-data; boundary=…"
         )
-    return kind, boundary
+    return Announced(kind, boundary, length)
 
 
 def too_large(limits: Limits) -> Refusal:

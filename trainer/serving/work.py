@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zipfile
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -20,8 +19,11 @@ from trainer.sequences import SequenceDenoiser
 from trainer.serving.batching import Batcher
 from trainer.serving.limits import Budget, Limits, Refusal, Ticket
 from trainer.serving.readers import Readers
+from trainer.serving.room import Place
 
 EXR, ZIP = "image/x-exr", "application/zip"
+_HEADERS = 1 << 20
+"""Bytes that a file has beside its pixels, at most."""
 
 
 @dataclass(frozen=True)
@@ -76,19 +78,21 @@ class Workshop:
         self.batcher, self.readers = batcher, readers
         self.budget = Budget(limits.frame_bytes)
 
-    def work(self, folder: Path, name: str, wish: Wish, ticket: Ticket) -> Done:
+    def work(self, place: Place, name: str, wish: Wish, ticket: Ticket) -> Done:
         """Denoise an uploaded file.
 
         Args:
-            folder: Of this request; results are written into it.
-            name: Of the file in it.
+            place: Of this request; results are written into the folder of the upload.
+            name: Of the file there.
             wish: What is wanted.
             ticket: Until when.
 
         Raises:
-            Refusal: Something is wrong with the file.
+            Refusal: Something is wrong with the file, or there is no room for what comes of it.
             Over: Nobody waits for the result any more.
         """
+        folder = place.upload
+        place.take(self.readers.room(folder, name, ticket))
         frames = self.readers.frames(folder, name, ticket)
         sizes = {Path(frame["name"]): int(frame["bytes"]) for frame in frames}
         notes: dict[str, None] = {}
@@ -97,7 +101,7 @@ class Workshop:
             for path in in_order(sizes)
         )
         denoiser = self._denoiser(Clip(items), wish, ticket, notes)
-        sink = _Sink(folder, name if len(frames) == 1 and str(frames[0]["name"]) == name else None, wish)
+        sink = _Sink(place, name if len(frames) == 1 and str(frames[0]["name"]) == name else None, wish)
         held = max(sizes.values()) * self._copies(len(items))
         with self.budget.hold(held, ticket), ExitStack() as stack:
             stack.callback(sink.close)
@@ -146,14 +150,14 @@ class _Sink:
     """Where the results of a request go: one EXR file, or a ZIP of them for a ZIP.
 
     Args:
-        folder: Of the request.
+        place: Of the request.
         single: Name of the file where it is one EXR.
         wish: What is wanted.
     """
 
-    def __init__(self, folder: Path, single: str | None, wish: Wish) -> None:
-        self.single, self.wish = single, wish
-        self.folder = folder / "denoised"
+    def __init__(self, place: Place, single: str | None, wish: Wish) -> None:
+        self.place, self.single, self.wish = place, single, wish
+        self.folder = place.upload / "denoised"
         self.folder.mkdir()
         self.path = self.folder / (single or "denoised.zip")
         self.archive = None if single else zipfile.ZipFile(self.path, "x")
@@ -162,7 +166,11 @@ class _Sink:
     def add(self, item: Item, result: Result) -> None:
         """Write a frame."""
         target = self.folder / f"{item.name}.exr"
+        # Compression may fail to make it smaller; a ZIP file holds it for a second time until it is removed.
+        most = 2 * (result.frame.buffers["color"].nbytes + _HEADERS)
+        self.place.take(most)
         write_frame(result.frame, target, single=self.wish.single)
+        self.place.give_back(most - target.stat().st_size)
         self.exposure = self.exposure or result.exposure
         self.pixels += result.frame.height * result.frame.width
         if self.archive is not None:
@@ -178,8 +186,3 @@ class _Sink:
         """Return the result."""
         kind = EXR if self.single else ZIP
         return Done(self.path, kind, notes, self.exposure, self.pixels)
-
-
-def remove(folder: Path) -> None:
-    """Remove what a request left behind."""
-    shutil.rmtree(folder, ignore_errors=True)

@@ -93,6 +93,8 @@ class Delivery:
         self.uri = self.record.tracking_uri or ""
         self.sent = Sent.load(folder)
         self.counts = {"metrics": 0, "files": 0}
+        self.limit: int | None = None
+        """Bytes of the journal that may be sent, None for all of it; see `Sender.deliver_up_to`."""
         self._client: MlflowClient | None = None
 
     def step(self) -> int:
@@ -129,6 +131,8 @@ class Delivery:
         group: list[tuple[Event, int]] = []
         size = 0
         for event, offset in events(self.folder, self.sent.offset):
+            if self.limit is not None and offset > self.limit:
+                break
             if event["type"] not in BATCHES:
                 return group or [(event, offset)]
             group.append((event, offset))

@@ -116,6 +116,10 @@ class Sender(threading.Thread):
         finally:
             self._lock.release()
 
+    def deliver_up_to(self, offset: int | None) -> None:
+        """Keep from the store what lies behind an offset in bytes of the journal; None: nothing."""
+        self._delivery.limit = offset
+
     def drain(self, wait_s: float) -> int:
         """Wait until everything is sent, at most `wait_s` seconds; returns the number of events left.
 

@@ -7,9 +7,14 @@ import uuid
 import pytest
 import torch
 
-from trainer.cluster.restoring import kept_files, step_of, unpack
+from trainer.cluster.restoring import kept_files, reached, share_newest, unpack
 from trainer.cluster.storage import fetch_checkpoint, fetch_run, send_run, storage_url
 from trainer.runs import Launch, RunRecord, begin_launch, find_checkpoint
+
+
+@pytest.fixture(autouse=True)
+def hasty(monkeypatch):
+    monkeypatch.setattr("trainer.cluster.storage.SETTLE_S", 0)
 
 
 def make_run(root, step, launch="one"):
@@ -40,7 +45,7 @@ def test_run_is_fetched_where_another_node_has_none(tmp_path, storage):
     fetched = fetch_run(storage, "one", tmp_path / "there")
     assert fetched == tmp_path / "there" / "exp" / folder.name
     assert RunRecord.load(fetched) == RunRecord.load(folder)
-    assert step_of(fetched) == 4
+    assert reached(fetched) == (1, 4)
     assert fetch_run(storage, "another", tmp_path / "there") is None
 
 
@@ -49,8 +54,15 @@ def test_newest_checkpoint_wins_on_both_ways(tmp_path, storage):
     send_run(folder, storage_url(storage), sent)
     save(folder, 6)
     send_run(folder, storage_url(storage), sent, everything=False)
-    assert fetch_run(storage, "one", tmp_path / "there", newer_than=6) is None
-    assert step_of(fetch_run(storage, "one", tmp_path / "there", newer_than=4)) == 6
+    assert fetch_run(storage, "one", tmp_path / "there", newer_than=(1, 6)) is None
+    assert reached(fetch_run(storage, "one", tmp_path / "there", newer_than=(1, 4))) == (1, 6)
+
+
+def test_later_attempt_wins_over_a_later_step(tmp_path, storage):
+    folder = make_run(tmp_path / "here", 4)
+    begin_launch(folder, Launch("one"))
+    send_run(folder, storage_url(storage), {})
+    assert reached(fetch_run(storage, "one", tmp_path / "there", newer_than=(1, 8))) == (2, 4)
 
 
 def test_only_what_changed_is_sent(tmp_path, storage, monkeypatch):
@@ -69,7 +81,7 @@ def test_checkpoint_at_a_url_brings_its_run(tmp_path, storage, monkeypatch):
     assert found == tmp_path / "there" / "exp" / folder.name / "checkpoints" / "last.ckpt"
     assert RunRecord.load(found.parent.parent).run_id == "id"
     save(found.parent.parent, 8)
-    assert step_of(fetch_checkpoint(url, tmp_path / "there").parent.parent) == 8
+    assert reached(fetch_checkpoint(url, tmp_path / "there").parent.parent) == (1, 8)
 
 
 def test_lone_checkpoint_at_a_url_goes_into_the_cache(tmp_path, monkeypatch):
@@ -97,12 +109,30 @@ def test_packed_run_is_whole_where_it_is_unpacked(tmp_path):
     assert {n: p.read_bytes() for n, p in kept_files(tmp_path / "there").items()} == files
 
 
-def test_unreachable_storage_is_told_once_and_training_goes_on(tmp_path, capsys):
-    from trainer.callbacks import MirrorRun
+@pytest.fixture
+def alone(tmp_path, monkeypatch):
+    """A group of one rank, of a launch that has begun before."""
+    monkeypatch.setenv("PENUMBRA_LAUNCH", "one")
+    torch.distributed.init_process_group("gloo", f"file://{tmp_path}/group", rank=0, world_size=1)
+    yield
+    torch.distributed.destroy_process_group()
 
+
+def test_unreachable_storage_does_not_end_a_restart_with_a_checkpoint_here(tmp_path, alone, capsys):
+    make_run(tmp_path / "here", 4)
     (tmp_path / "file").write_text("")
-    mirror = MirrorRun(str(tmp_path / "file" / "below"))
-    mirror._folder = make_run(tmp_path / "here", 4)
-    assert not mirror._pass(everything=True)
-    assert not mirror._pass(everything=True)
-    assert capsys.readouterr().err.count("not mirrored") == 1
+    unreachable = str(tmp_path / "file" / "below")
+    (tmp_path / "empty").mkdir()
+    share_newest(tmp_path / "here", "exp", unreachable)
+    said = capsys.readouterr().err
+    assert "warning: cannot read" in said
+    assert "goes on from the checkpoint of step 4" in said
+    with pytest.raises(OSError, match="cannot read"):
+        share_newest(tmp_path / "empty", "exp", unreachable)
+
+
+def test_damaged_checkpoint_is_no_run_to_go_on_from(tmp_path):
+    folder = make_run(tmp_path / "here", 4)
+    (folder / "checkpoints" / "last.ckpt").write_bytes(b"PK\x03\x04 and nothing more")
+    with pytest.raises(ValueError, match="truncated"):
+        reached(folder)
