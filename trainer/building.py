@@ -23,6 +23,9 @@ FORMS = (
 )
 """What `--model` may be, for messages."""
 
+OUTSIDE = {"OIDN": "trainer.oidn.OIDN"}
+"""Denoisers that are libraries of their own, to compare with: name → import path."""
+
 
 def class_path_of(name: str, asked: str = "--model") -> str:
     """Return the import path of a denoiser that is named by its class.
@@ -34,11 +37,14 @@ def class_path_of(name: str, asked: str = "--model") -> str:
     Raises:
         FileNotFoundError: Penumbra has none of that name; the message lists those it has.
     """
+    if name in OUTSIDE:
+        return OUTSIDE[name]
     if "." not in name and name not in models.__all__:
-        folded = {known.casefold(): known for known in models.__all__}
+        names = (*models.__all__, *OUTSIDE)
+        folded = {known.casefold(): known for known in names}
         near = difflib.get_close_matches(name.casefold(), folded, n=1)
         hint = f"; did you mean {folded[near[0]]}?" if near else ""
-        known = ", ".join(models.__all__)
+        known = ", ".join(names)
         if asked != "--model":
             raise FileNotFoundError(f"{asked} {name}: no such denoiser{hint} (there are {known})")
         raise FileNotFoundError(
