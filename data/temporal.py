@@ -140,7 +140,7 @@ class Accumulator:
         )
 
     def _blend(self, frame: Frame, last: Frame) -> tuple[Image, Image, str]:
-        target, how = _previous_pixels(frame, last)
+        target, how = previous_pixels(frame, last)
         colors, counts, kept = _gather(frame, last, target, self._thresholds(frame))
         irradiance, history = blend(frame.buffers["irradiance"], colors, counts, kept)
         return irradiance, history, how
@@ -183,7 +183,7 @@ def blend(
     return result.astype(np.float32), number[..., None].astype(np.float32)
 
 
-def _previous_pixels(frame: Frame, last: Frame) -> tuple[NDArray[np.float32], str]:
+def previous_pixels(frame: Frame, last: Frame) -> tuple[NDArray[np.float32], str]:
     """Return where each pixel's surface was, as indices x and y (2, H, W); NaN where nowhere."""
     moved = np.full((2, frame.height, frame.width), np.nan, np.float32)
     if "motion" in frame.buffers:
