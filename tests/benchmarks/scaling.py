@@ -88,7 +88,7 @@ class StepTimes(Callback):
 
 def start(folder: Path, name: str, torchrun: bool, model: str = "") -> subprocess.Popen[bytes]:
     """Start a training of a few steps whose times go to `folder/name.RANK`."""
-    callback = f"{{class_path: {__name__}.StepTimes, init_args: {{path: {folder / name}}}}}"
+    callback = f"{{class_path: tests.benchmarks.scaling.StepTimes, init_args: {{path: {folder / name}}}}}"
     command = [sys.executable, "-m"]
     if torchrun:
         command += ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
