@@ -24,6 +24,8 @@ COMMANDS = {
     "prepare": "cut frames into shards of training patches",
     "inspect": "say what a file, a data set or shards contain",
     "denoise": "denoise EXR files and sequences",
+    "benchmark": "measure time and memory of denoisers, or compare two",
+    "evaluate": "compare denoisers on the same frames: metrics, tables, a report",
     "export": "write a trained denoiser as ONNX or TorchScript",
     "models": "list denoisers, their options, and registered models",
     "upload": "send a run that was tracked locally to a tracking server",

@@ -47,6 +47,7 @@ class Settings:
         attention: Column and row of the pixel whose attention is wanted.
         tile: Largest side of a tile in pixels; None: only the memory limits it.
         run: Calls the model on a tile; None: here and now.
+        finite: Refuse results that hold NaN or Inf.
     """
 
     exposure: float | None = None
@@ -57,6 +58,7 @@ class Settings:
     attention: tuple[int, int] | None = None
     tile: int | None = None
     run: Run | None = None
+    finite: bool = True
 
 
 @dataclass(frozen=True)
@@ -232,7 +234,7 @@ class ClipDenoiser:
             ValueError: The model returned NaN or Inf.
         """
         frame, image = prepared.frame, _image(color)
-        if not np.isfinite(image).all():
+        if self.settings.finite and not np.isfinite(image).all():
             raise ValueError(
                 f"{frame.label}: the model returned NaN or Inf; train it again or report the frame"
             )

@@ -20,7 +20,7 @@ from models.tiling import Tileable, core_size, denoise_in_tiles, times_read
 from trainer.clips import Clip, Item
 from trainer.denoising import ClipDenoiser, Prepared, Result, Settings
 from trainer.loading import Loaded, Model
-from trainer.progress import FrameProgress
+from trainer.progress import Heard
 
 COSTLY = 3.0
 """How often a frame may be computed before it is said that more memory would help."""
@@ -82,7 +82,7 @@ def _spatial(model: Tileable, size: tuple[int, int], budget: int, frames: int) -
     return times_read(model, (tall, wide), core_size(model, (tall, wide), budget, frames))
 
 
-def denoiser_of(loaded: Loaded, clip: Clip, settings: Settings, progress: FrameProgress) -> ClipDenoiser:
+def denoiser_of(loaded: Loaded, clip: Clip, settings: Settings, progress: Heard) -> ClipDenoiser:
     """Return what denoises the frames of a clip; raises as `ClipDenoiser`."""
     cls = SequenceDenoiser if loaded.model.frames else ClipDenoiser
     return cls(loaded, clip, settings, progress.say, progress.within)

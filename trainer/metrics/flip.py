@@ -115,6 +115,11 @@ def flip_hdr(output: Tensor, reference: Tensor) -> Tensor:
     return flip_hdr_map(output, reference).flatten(1).mean(1)
 
 
+def flip_ldr_srgb(output: Tensor, reference: Tensor) -> Tensor:
+    """Mean LDR-FLIP per image (B,) at 67 pixels per degree, of exposed radiance (B, 3, H, W) clipped to 1."""
+    return flip_ldr_map(output, reference).flatten(1).mean(1)
+
+
 def _clean(image: Tensor) -> Tensor:
     return torch.nan_to_num(image.float(), 0.0, 1e12, 0.0).clamp_min(0)
 

@@ -1,0 +1,208 @@
+"""`trainer evaluate`: compare denoisers on the same frames."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trainer.commands.denoise import size_in_bytes
+
+if TYPE_CHECKING:
+    from trainer.evaluation.plan import Method
+    from trainer.evaluation.running import Outcome, Setting
+    from trainer.evaluation.tables import Table
+
+HELP = "compare denoisers on the same frames: metrics, tables, a report"
+
+
+class _Model(argparse.Action):
+    """Begins a method; options that follow are its own."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        namespace.models = [*(namespace.models or []), (values, [])]
+
+
+class _Option(argparse.Action):
+    """Adds an option to the last method."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        if not namespace.models:
+            parser.error(f"--option {values}: expected after the --model that it is for")
+        namespace.models[-1][1].append(values)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Define the options."""
+    parser.add_argument(
+        "--model",
+        dest="models",
+        action=_Model,
+        required=True,
+        metavar="[LABEL=]MODEL",
+        help="a method, as of `trainer denoise`, or OIDN; repeat it for each; LABEL is its name in tables",
+    )
+    parser.add_argument(
+        "--option",
+        action=_Option,
+        metavar="KEY=VALUE",
+        help="option of the --model before it, where that is named by its class, such as preset=paper",
+    )
+    parser.add_argument(
+        "--data",
+        required=True,
+        metavar="ROOT",
+        help="ingested data set, folder of a known layout or of EXR files, or sample:NAME",
+    )
+    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for everything")
+    parser.add_argument(
+        "--split",
+        choices=("auto", "train", "validation", "test", "all"),
+        default="auto",
+        help="which scenes of a data set (default: its test scenes, all where it has none)",
+    )
+    parser.add_argument(
+        "--metric",
+        action="append",
+        dest="metrics",
+        metavar="NAME",
+        help="take only this metric; may be repeated (default: all)",
+    )
+    parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 … (default: cpu)")
+    parser.add_argument(
+        "--memory",
+        type=size_in_bytes,
+        default=size_in_bytes("2GB"),
+        metavar="SIZE",
+        help="memory that a method may take, larger images are tiled (default: 2GB)",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="processes that take metrics meanwhile (default: 1)"
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 if any method or frame is left out, or returned NaN",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate; returns the exit code.
+
+    Raises:
+        UsageError: A metric is unknown, or labels are the same.
+        ValueError: There is nothing to evaluate, or the folder holds something else.
+        OSError: A file cannot be read or written.
+    """
+    from trainer.commands.denoise import check_device
+    from trainer.evaluation.plan import clips_of, methods_of
+    from trainer.evaluation.record import rows_of, write_record, write_rows, write_tables
+    from trainer.evaluation.running import Evaluation, Setting
+    from trainer.outputs import make_folder
+    from trainer.progress import FrameProgress
+
+    check_device(args.device)
+    metrics = _metrics(args.metrics)
+    methods = methods_of(args.models)
+    clips, split = clips_of(args.data, args.split)
+    names: dict[str, str | None] = {}
+    for clip in clips:
+        before: str | None = None
+        for item in clip.items:
+            names[item.name], before = before, item.name if clip.sequence else None
+    make_folder(args.output)
+    _refuse_other(args.output)
+    setting = Setting(
+        args.data, split, _identity(args.data, names), names, args.output, metrics, args.device,
+        args.memory, args.jobs,
+    )  # fmt: skip
+    _announce(methods, len(names), split)
+    with FrameProgress(len(names) * (len(methods) + 1)) as progress:
+        outcomes = Evaluation(setting, progress).run(methods)
+    rows = rows_of(outcomes, setting)
+    write_rows(rows, args.output)
+    tables = write_tables(rows, [o.method.label for o in outcomes], setting)
+    write_record(outcomes, rows, setting, {})
+    _print(outcomes, tables, setting)
+    return _status(outcomes, args.strict)
+
+
+def _metrics(named: Sequence[str] | None) -> tuple[str, ...]:
+    import difflib
+
+    from trainer.configs import UsageError
+    from trainer.metrics.measures import LEFT_OUT, SCORES
+
+    for name in named or ():
+        if name in LEFT_OUT:
+            raise UsageError(f"--metric {name}: {LEFT_OUT[name]}")
+        if name not in SCORES:
+            near = difflib.get_close_matches(name, SCORES, n=1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise UsageError(f"--metric {name}: unknown{hint} (there are {', '.join(SCORES)})")
+    return tuple(name for name in SCORES if not named or name in named)
+
+
+def _identity(root: str, names: dict[str, str | None]) -> str:
+    """Return what tells a data set from another: the hash of its manifest, or the names of its frames."""
+    import hashlib
+
+    from data.manifest import file_sha256
+    from data.root import SAMPLE, resolve_root
+
+    path = resolve_root(root).path if root.startswith(SAMPLE) else Path(root).expanduser()
+    manifest = Path(path) / "manifest.json"
+    if manifest.is_file():
+        return file_sha256(manifest)
+    return hashlib.sha256("\n".join([str(Path(path).resolve()), *names]).encode()).hexdigest()
+
+
+def _refuse_other(folder: Path) -> None:
+    """Refuse a folder that holds something else than an evaluation."""
+    there = {path.name for path in folder.iterdir()}
+    if there and not there & {"evaluation.json", "rows.jsonl", "logs"}:
+        raise ValueError(f"{folder} holds something else than an evaluation; choose another --output")
+
+
+def _announce(methods: Sequence[Method], frames: int, split: str | None) -> None:
+    which = f"of the {split} split" if split else "in all"
+    plural = "s" * (frames != 1)
+    print(
+        f"{len(methods)} method{'s' * (len(methods) != 1)} on {frames} frame{plural} {which}", file=sys.stderr
+    )
+
+
+def _print(outcomes: Sequence[Outcome], tables: Sequence[Table], setting: Setting) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table as Rich
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=100)
+    styles = {1: "bold", 2: "underline"}
+    for table in (t for t in tables if t.name.startswith("overview")):
+        shown = Rich(title=table.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        shown.add_column(table.corner)
+        for column in table.columns:
+            shown.add_column(column.replace("_", "_\u200b"), justify="right")
+        for head, cells in table.rows:
+            shown.add_row(
+                head, *(f"[{styles[c.rank]}]{c.text()}[/]" if c.rank in styles else c.text() for c in cells)
+            )
+        console.print(shown)
+    for outcome in outcomes:
+        if told := outcome.told():
+            print(f"{outcome.method.label}: {outcome.status}: {told}", file=sys.stderr)
+    lacking = sum(not row.get("reference", True) for row in outcomes[0].rows.values())
+    if lacking:
+        print(f"{lacking} frames have no reference: denoised, without metrics", file=sys.stderr)
+    print(f"written to {setting.folder}", file=sys.stderr)
+
+
+def _status(outcomes: Sequence[Outcome], strict: bool) -> int:
+    good = [outcome for outcome in outcomes[1:] if outcome.status != "skipped"]
+    whole = all(outcome.told() is None for outcome in outcomes)
+    return 0 if good and (whole or not strict) else 1

@@ -1,0 +1,112 @@
+"""What is compared on what: methods with their names, frames, and the folder that holds all of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from trainer.clips import Clip, find_clips
+
+INPUT, REFERENCE, PLACES = "input", "reference", "places"
+"""Folders below `images` beside those of the methods: the noisy frames, what they should be, and where each
+pixel was in the frame before."""
+
+NOISY = "trainer.evaluation.noisy.Noisy"
+
+
+@dataclass(frozen=True)
+class Method:
+    """One column of the tables.
+
+    Attributes:
+        label: Its name there.
+        model: What `--model` named.
+        options: `KEY=VALUE` of a method that is named by its class.
+        folder: Name of its folder below `images`.
+    """
+
+    label: str
+    model: str
+    options: tuple[str, ...] = ()
+    folder: str = ""
+
+
+def methods_of(named: Sequence[tuple[str, Sequence[str]]]) -> list[Method]:
+    """Return the methods that models with their options mean, with different names.
+
+    Args:
+        named: `MODEL` or `LABEL=MODEL`, and its options.
+
+    Raises:
+        ValueError: A label was given twice, or is that of the input or the reference.
+    """
+    found: list[Method] = []
+    for text, options in named:
+        label, model = _split(text)
+        given = label is not None
+        label = label or " ".join([_short(model), *options])
+        taken = {method.label for method in found} | {INPUT, REFERENCE, PLACES}
+        if given and label in taken:
+            raise ValueError(f"--model {text}: {label} is the name of another column; choose another")
+        name, number = label, 1
+        while name in taken:
+            number += 1
+            name = f"{label} ({number})"
+        found.append(Method(name, model, tuple(options)))
+    return _with_folders(found)
+
+
+def _split(text: str) -> tuple[str | None, str]:
+    """Return the label and the model of `LABEL=MODEL`."""
+    label, sign, model = text.partition("=")
+    if not sign or not label.strip() or not model or any(mark in label for mark in ":/\\"):
+        return None, text
+    return label.strip(), model
+
+
+def _short(model: str) -> str:
+    """Return how a model is called in tables: its name without folders, `wskp/3` of `models:/wskp/3`."""
+    if found := re.match(r"(?:models|runs):/+(.+)", model):
+        return found[1]
+    path = Path(model)
+    parts = [part for part in path.parts if part not in ("checkpoints", "/")]
+    if path.suffix == ".ckpt" and len(parts) > 1:
+        return parts[-2] if path.stem in ("best", "last") else f"{parts[-2]} {path.stem}"
+    return path.stem if path.suffix in (".onnx", ".ts", ".pt", ".pth") else path.name or model
+
+
+def _with_folders(methods: Iterable[Method]) -> list[Method]:
+    found: list[Method] = []
+    taken = {INPUT, REFERENCE, PLACES}
+    for method in methods:
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", method.label).strip("-.")[:60] or "method"
+        folder, number = name, 1
+        while folder.lower() in taken:
+            number += 1
+            folder = f"{name}-{number}"
+        taken.add(folder.lower())
+        found.append(replace(method, folder=folder))
+    return found
+
+
+def clips_of(root: str, split: str) -> tuple[list[Clip], str | None]:
+    """Return the frames of a data set and the split that they are, None for all there are.
+
+    Args:
+        root: As a path of `trainer denoise`.
+        split: `train`, `validation`, `test`, `all`, or `auto`: the test split of a data set that has one.
+
+    Raises:
+        ValueError: As `trainer.clips.find_clips`.
+        FileNotFoundError: There is no such path.
+    """
+    if split not in ("auto", "all"):
+        return find_clips([root], split), split
+    if split == "auto":
+        try:
+            return find_clips([root], "test"), "test"
+        except ValueError:
+            pass  # no splits, or no test scene
+    return find_clips([root], None), None

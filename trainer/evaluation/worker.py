@@ -1,0 +1,229 @@
+"""One method on all frames, in a process of its own: `python -m trainer.evaluation.worker`.
+
+Standard input is a `Task` as one line of JSON and, after the worker told the model's `facts`, the names of
+frames that are there already; standard output is one JSON object a line (`facts`, `row`, `say`, `within`,
+`reason`), standard error is for people. Results are written before their row is told, so that a row means a
+picture.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from data.exr_image import write_exr
+from data.frame import Frame, Image
+from trainer.clips import Clip, Item
+from trainer.denoising import ClipDenoiser, Result, Settings
+from trainer.evaluation.plan import INPUT, PLACES, REFERENCE, clips_of
+from trainer.loading import Loaded, resolve
+from trainer.outputs import replacing
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a worker does.
+
+    Attributes:
+        model: As `--model` of `trainer denoise`.
+        options: Of a method that is named by its class.
+        root: The data set.
+        split: Which part of it, None for all.
+        images: Folder that all images go to.
+        folder: The method's own folder below it.
+        device: Where it runs.
+        memory: Bytes that it may take for a call.
+        threads: Of PyTorch; 0: its own choice.
+    """
+
+    model: str
+    options: tuple[str, ...]
+    root: str
+    split: str | None
+    images: str
+    folder: str
+    device: str = "cpu"
+    memory: int = 2 * 1024**3
+    threads: int = 0
+
+
+class Worker:
+    """Denoises clips and tells about it.
+
+    Args:
+        task: What to do.
+        heard: Where answers come from.
+        out: Where to tell.
+    """
+
+    def __init__(self, task: Task, heard: TextIO, out: TextIO) -> None:
+        self.task, self.heard, self.out = task, heard, out
+        self.images = Path(task.images)
+        self._share, self._told = 0.0, 0.0
+
+    def tell(self, **message: Any) -> None:
+        """Write one line."""
+        print(json.dumps(message), file=self.out, flush=True)
+
+    def say(self, text: str, kind: str = "note", /) -> None:
+        """Pass a remark on."""
+        self.tell(say=text, kind=kind)
+
+    def within(self, frames: float) -> None:
+        """Pass on that the work went on by a fraction of a frame."""
+        self._share += frames
+        if time.monotonic() - self._told > 0.2:
+            self.tell(within=self._share)
+            self._share, self._told = 0.0, time.monotonic()
+
+    def run(self) -> None:
+        """Denoise everything that is not there yet.
+
+        Raises:
+            ValueError: The model cannot be loaded.
+            OSError: The data set cannot be read, or a result not written.
+        """
+        loaded = resolve(self.task.model, self.task.device, options=self.task.options)
+        self.tell(facts=facts_of(loaded))
+        there = set(json.loads(self.heard.readline() or "[]"))
+        clips, _ = clips_of(self.task.root, self.task.split or "all")
+        for clip in clips:
+            for part in parts(clip, loaded):
+                if any(item.name not in there for item in part.items):
+                    self.clip(loaded, part)
+
+    def clip(self, loaded: Loaded, clip: Clip) -> None:
+        """Denoise the frames of a clip; one that fails is told with its reason, the others go on."""
+        from trainer.sequences import denoiser_of
+
+        settings = Settings(memory=self.task.memory, device=self.task.device, finite=False)
+        denoiser = denoiser_of(loaded, clip, settings, self)
+        previous: Frame | None = None
+        waiting: list[Item] = []
+        spent = 0.0
+        for item in clip.items:
+            waiting.append(item)
+            try:
+                frame = item.read()
+                began = time.perf_counter()
+                results = list(self.results(denoiser, clip, item, frame))
+                spent += time.perf_counter() - began
+            except (ValueError, OSError, RuntimeError, MemoryError) as error:
+                reason = (str(error).splitlines() or [repr(error)])[0]
+                failed, waiting = waiting, []
+                for one in failed:
+                    self.tell(row={"name": one.name, "status": "failed", "reason": reason})
+                denoiser, previous, spent = denoiser_of(loaded, clip, settings, self), None, 0.0
+                continue
+            if self.task.folder == INPUT:
+                self.known(item, frame, previous)
+            previous = frame
+            for done, result in results:
+                waiting = [one for one in waiting if one.name != done.name]
+                self.row(done, result, spent / len(results))
+                spent = 0.0
+
+    def results(
+        self, denoiser: ClipDenoiser, clip: Clip, item: Item, frame: Frame
+    ) -> Iterable[tuple[Item, Result]]:
+        """Return what is finished with a frame."""
+        yield from denoiser.push(item, frame)
+        if item is clip.items[-1]:
+            yield from denoiser.finish()
+
+    def row(self, item: Item, result: Result, seconds: float) -> None:
+        """Write a result and tell of it."""
+        image, frame = result.frame.buffers["color"], result.frame
+        write_image(self.images / self.task.folder / f"{item.name}.exr", image)
+        bad = int((~np.isfinite(image).all(-1)).sum())
+        row = {
+            "name": item.name,
+            "scene": frame.scene,
+            "frame": frame.index,
+            "spp": frame.spp,
+            "width": frame.width,
+            "height": frame.height,
+            "exposure": result.exposure,
+            "reference": result.reference is not None,
+            "seconds": seconds,
+            "nonfinite": bad,
+            "status": "nonfinite" if bad else "done",
+            "reason": f"{bad} pixel{'s are' if bad > 1 else ' is'} NaN or Inf" if bad else None,
+        }
+        self.tell(row=row)
+
+    def known(self, item: Item, frame: Frame, previous: Frame | None) -> None:
+        """Write what is the same for all methods: the reference, and where pixels were before."""
+        if "reference" in frame.buffers:
+            write_image(self.images / REFERENCE / f"{item.name}.exr", frame.buffers["reference"])
+        if previous is None or (previous.scene, previous.index + 1) != (frame.scene, frame.index):
+            return
+        from trainer.metrics.temporal import places_before
+
+        try:
+            places = places_before(frame, previous)
+        except ValueError:
+            return  # nothing says where its pixels were: no temporal metrics
+        target = self.images / PLACES / f"{item.name}.npz"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(target) as temporary:
+            np.savez_compressed(temporary, places=places)
+
+
+def parts(clip: Clip, loaded: Loaded) -> list[Clip]:
+    """Return what can be denoised one without the other: single frames where they are independent views."""
+    if clip.sequence:
+        return [clip]
+    return [Clip((item,), False, clip.depth, clip.thresholds) for item in clip.items]
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write radiance (H, W, 3) in float32, whatever it holds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    planes = {letter: np.ascontiguousarray(image[..., c], np.float32) for c, letter in enumerate("RGB")}
+    write_exr(path, planes)
+
+
+def facts_of(loaded: Loaded) -> dict[str, Any]:
+    """Return what tables say about a method beside its label."""
+    from models.denoiser import Denoiser
+
+    model, source = loaded.model, loaded.source
+    known = isinstance(model, Denoiser)
+    return {
+        "class": type(model).__name__ if isinstance(model, Denoiser) else model.description.model,
+        "parameters": sum(p.numel() for p in model.parameters()) if known else None,
+        "deployed": sum(p.numel() for p in loaded.deployed.parameters()) if known else None,
+        "inputs": list(model.inputs),
+        "options": source.init_args,
+        "sha256": source.sha256,
+    }
+
+
+def main() -> int:
+    """Read a task, do it; returns the exit status."""
+    import torch
+
+    given = json.loads(sys.stdin.readline())
+    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+    if task.threads:
+        torch.set_num_threads(task.threads)
+    worker = Worker(task, sys.stdin, sys.stdout)
+    sys.stdout = sys.stderr  # whatever a library prints must not get between the lines
+    try:
+        worker.run()
+    except (ValueError, OSError) as error:
+        worker.tell(reason=(str(error).splitlines() or [repr(error)])[0])
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
