@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 from trainer.commands.denoise import size_in_bytes
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from trainer.evaluation.plan import Method
     from trainer.evaluation.running import Outcome, Setting
-    from trainer.evaluation.tables import Table
+    from trainer.evaluation.tables import Scored, Table
 
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
 
@@ -81,6 +83,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N", help="processes that take metrics meanwhile (default: 1)"
     )
+    parser.add_argument("--no-track", action="store_true", help="do not record the evaluation in MLflow")
+    parser.add_argument(
+        "--register-champion",
+        metavar="METRIC",
+        help="of the registered versions among the models (models:/NAME/3): move the alias `champion` to the "
+        "best one, unless a scene gets worse than with the champion so far, which is evaluated too",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=_share,
+        default=0.01,
+        metavar="SHARE",
+        help="by how much of its value a scene may get worse for a new champion (default: 0.01)",
+    )
     parser.add_argument(
         "--strict",
         action="store_true",
@@ -97,15 +113,22 @@ def run(args: argparse.Namespace) -> int:
         OSError: A file cannot be read or written.
     """
     from trainer.commands.denoise import check_device
+    from trainer.evaluation.champion import champions_beside
     from trainer.evaluation.plan import clips_of, methods_of
     from trainer.evaluation.record import rows_of, write_record, write_rows, write_tables
     from trainer.evaluation.running import Evaluation, Setting
+    from trainer.evaluation.tables import Scored
+    from trainer.loading import model_store
     from trainer.outputs import make_folder
     from trainer.progress import FrameProgress
 
     check_device(args.device)
     metrics = _metrics(args.metrics)
     methods = methods_of(args.models)
+    if args.register_champion:
+        (judge,) = _metrics([args.register_champion])
+        metrics = tuple(dict.fromkeys([*metrics, judge]))
+        methods = methods_of([*args.models, *champions_beside(methods, model_store())])
     clips, split = clips_of(args.data, args.split)
     names: dict[str, str | None] = {}
     for clip in clips:
@@ -126,7 +149,57 @@ def run(args: argparse.Namespace) -> int:
     tables = write_tables(rows, [o.method.label for o in outcomes], setting)
     write_record(outcomes, rows, setting, {})
     _print(outcomes, tables, setting)
+    if not args.no_track:
+        _track(outcomes, rows, setting)
+    if args.register_champion:
+        _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
     return _status(outcomes, args.strict)
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no share; expected a number from 0 to 1, such as 0.01")
+    return value
+
+
+def _track(outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting) -> None:
+    """Record the evaluation; a store that cannot be used is told and loses nothing."""
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from trainer.evaluation.tracking import EXPERIMENT, track
+    from trainer.spool.store import described, tracking_uri
+
+    uri = tracking_uri(None)
+    try:
+        track(setting.folder, outcomes, rows, setting.metrics, uri)
+    except (MlflowException, SQLAlchemyError, OSError) as error:
+        first = (str(error).splitlines() or [repr(error)])[0]
+        print(
+            f"note: not recorded in {described(uri)}: {first}; run the command again to do so",
+            file=sys.stderr,
+        )
+        return
+    print(f"recorded in {described(uri)}, experiment {EXPERIMENT}", file=sys.stderr)
+
+
+def _crown(methods: Sequence[Method], scored: Scored, args: argparse.Namespace) -> None:
+    """Move the alias of each registered model, or say why it stays."""
+    from trainer.evaluation.champion import champion_of, decide, move, registered
+    from trainer.loading import model_store
+
+    uri = model_store()
+    found = registered(methods, uri)
+    for name in dict.fromkeys(entry.name for entry in found):
+        entries = [entry for entry in found if entry.name == name]
+        decision = decide(scored, entries, champion_of(name, uri), args.register_champion, args.tolerance)
+        if decision.moves:
+            move(decision, uri)
+        print(decision.text(), file=sys.stderr)
 
 
 def _metrics(named: Sequence[str] | None) -> tuple[str, ...]:

@@ -1,0 +1,148 @@
+"""Which version of a registered model is the champion: the best one that is worse in no scene."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from trainer.evaluation.plan import Method
+from trainer.evaluation.tables import Scored
+from trainer.metrics.measures import SCORES
+from trainer.spool.store import open_client
+
+ALIAS = "champion"
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A method that is a version of a registered model.
+
+    Attributes:
+        label: Of the method.
+        name: Of the model.
+        version: Its number.
+    """
+
+    label: str
+    name: str
+    version: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether a version becomes the champion.
+
+    Attributes:
+        name: Of the model.
+        version: The best one.
+        before: The champion so far, None where there was none.
+        reasons: Why it does not become it; empty where it does, or is it already.
+    """
+
+    name: str
+    version: str
+    before: str | None
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def moves(self) -> bool:
+        """Whether the alias moves."""
+        return not self.reasons and self.version != self.before
+
+    def text(self) -> str:
+        """Return the decision in a sentence."""
+        what = f"models:/{self.name}/{self.version}"
+        if self.version == self.before:
+            return f"{what} stays the champion"
+        if self.moves:
+            return f"{what} is the champion now" + (f", version {self.before} was" if self.before else "")
+        return f"version {self.before} stays the champion of {self.name}: {what} {'; '.join(self.reasons)}"
+
+
+def champions_beside(methods: Sequence[Method], uri: str) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the champions of the methods' models that are not among the methods, as `methods_of` takes them.
+
+    Raises:
+        ValueError: None of the methods is a registered model.
+    """
+    found = registered(methods, uri)
+    if not found:
+        raise ValueError(
+            "--register-champion: none of the models is a registered version, such as models:/wskp/3"
+        )
+    named: list[tuple[str, tuple[str, ...]]] = []
+    for name in dict.fromkeys(entry.name for entry in found):
+        champion = champion_of(name, uri)
+        if champion and champion not in [e.version for e in found if e.name == name]:
+            named.append((f"{name}@{ALIAS}=models:/{name}/{champion}", ()))
+    return named
+
+
+def registered(methods: Sequence[Method], uri: str) -> list[Registered]:
+    """Return those methods that are registered versions.
+
+    Raises:
+        MlflowException: The store has no such model or alias.
+    """
+    client = open_client(uri)
+    found = []
+    for method in methods:
+        match = re.fullmatch(r"models:/+([^/@]+)(?:/([^/]+)|@(.+))", method.model)
+        if match is None:
+            continue
+        name, version, alias = match.groups()
+        if alias:
+            version = str(client.get_model_version_by_alias(name, alias).version)
+        elif version == "latest":
+            version = str(max(int(v.version) for v in client.search_model_versions(f"name = '{name}'")))
+        found.append(Registered(method.label, name, version))
+    return found
+
+
+def champion_of(name: str, uri: str) -> str | None:
+    """Return the version of a model that is its champion, None where it has none."""
+    model = open_client(uri).get_registered_model(name)
+    version = model.aliases.get(ALIAS)
+    return None if version is None else str(version)
+
+
+def decide(
+    scored: Scored, entries: Sequence[Registered], before: str | None, metric: str, tolerance: float
+) -> Decision:
+    """Return whether the best of a model's versions becomes its champion.
+
+    Args:
+        scored: The rows.
+        entries: Versions of one model that were evaluated.
+        before: The champion so far.
+        metric: By which they are judged, averaged over scenes.
+        tolerance: By which share a scene may get worse.
+    """
+    higher = SCORES[metric].higher
+    name = entries[0].name
+
+    def average(entry: Registered) -> float:
+        cell = scored.average(entry.label, metric)
+        if not cell.count or cell.missing:
+            return float("-inf")
+        return cell.mean if higher else -cell.mean
+
+    best = max(entries, key=average)
+    if average(best) == float("-inf"):
+        return Decision(name, best.version, before, (f"has no {metric} of every frame",))
+    old = next((entry for entry in entries if entry.version == before), None)
+    if old is None or best.version == before:
+        return Decision(name, best.version, before)
+    reasons = []
+    for scene in scored.scenes:
+        mine, theirs = (scored.cell(entry.label, metric, scene) for entry in (best, old))
+        worse = theirs.mean - mine.mean if higher else mine.mean - theirs.mean
+        if worse > tolerance * abs(theirs.mean):
+            reasons.append(f"is worse in {scene}: {metric} {mine.text()}, champion {theirs.text()}")
+    return Decision(name, best.version, before, tuple(reasons))
+
+
+def move(decision: Decision, uri: str) -> None:
+    """Move the alias."""
+    open_client(uri).set_registered_model_alias(decision.name, ALIAS, decision.version)
