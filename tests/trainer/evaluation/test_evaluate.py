@@ -73,9 +73,8 @@ def frames(tmp_path):
 
 
 def evaluate(monkeypatch, frames, output, *arguments):
-    monkeypatch.setattr(
-        sys, "argv", ["trainer", "evaluate", "--data", str(frames), "--output", str(output), *arguments]
-    )
+    where = ("--data", str(frames), "--output", str(output), "--no-track")
+    monkeypatch.setattr(sys, "argv", ["trainer", "evaluate", *where, *arguments])
     return main()
 
 
@@ -100,6 +99,7 @@ def test_rows_tables_and_pictures_are_written(monkeypatch, frames, tmp_path, cap
     assert "1 frames have no reference" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_fails_is_said_and_the_others_finish(monkeypatch, frames, tmp_path, capsys):
     output = tmp_path / "out"
     models = [
@@ -128,6 +128,7 @@ def test_what_fails_is_said_and_the_others_finish(monkeypatch, frames, tmp_path,
     assert "specular" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_and_adds_methods(monkeypatch, frames, tmp_path):
     output = tmp_path / "out"
     first = ("--model", f"half={HERE}.Halved", "--metric", "psnr_wskp")
@@ -142,6 +143,7 @@ def test_it_goes_on_where_it_was_and_adds_methods(monkeypatch, frames, tmp_path)
     assert list(pd.read_parquet(output / "rows.parquet")["method"].unique()) == ["input", "half", "same"]
 
 
+@pytest.mark.slow
 def test_other_metrics_are_taken_anew(monkeypatch, frames, tmp_path):
     output = tmp_path / "out"
     model = ("--model", f"half={HERE}.Halved")
