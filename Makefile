@@ -17,8 +17,9 @@ fit: $(READY)
 	$(BIN)/trainer test --config wskp_bmfr.yaml
 	$(BIN)/trainer denoise --model models:/wskp/latest sample:bmfr --split test --output $(OUTPUT) --png --force
 
+# One process for each core, files whole, one thread in each: half the time.
 test: $(DEV_READY)
-	$(BIN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n auto --dist loadfile
 
 test-all: $(DEV_READY)
 	$(BIN)/python -m pytest
