@@ -5,24 +5,33 @@
     runs/<experiment>/<run name>/        one run: run.json, config.yaml, checkpoints/, export/, pictures/
 
 A launch is what restarts a training that was killed: `torchrun --max-restarts`, a Ray job, a Slurm job that
-is requeued. The run that it trains says so in `launch.json`, so that a restart finds it again.
+is requeued. The run that it trains says so in `launch.json`, so that a restart finds it again. A script that
+one launch runs may train several times: the command line tells these trainings from each other.
 
 This module imports nothing heavy.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
 import os
 import socket
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
+from trainer import configs
+
 RUN_FILE = "run.json"
 LAUNCH_FILE = "launch.json"
 LAUNCH_VARIABLE = "PENUMBRA_LAUNCH"
+"""Names a launch."""
+TRAINING_VARIABLE = "PENUMBRA_TRAINING"
+"""Names one training whatever its command line: that of a Ray worker names other files every time."""
 
 
 @dataclass
@@ -134,10 +143,10 @@ def folder_of_checkpoint(checkpoint: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class Launch:
-    """What started this process and starts it again when it is killed.
+    """A training, as what started this process names it and starts it again when it is killed.
 
     Attributes:
-        identity: The same in every process and after every restart.
+        identity: The same in every process of the training and after every restart.
         restarts: Whether this is a restart, as far as that can be told.
         unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is
             a restart: who names a launch means that.
@@ -148,28 +157,56 @@ class Launch:
     unfinished: bool = False
 
 
-def current_launch(environment: Mapping[str, str] = os.environ) -> Launch | None:
-    """Return the launch that this process belongs to, None if nothing would restart it.
+def current_launch(
+    environment: Mapping[str, str] = os.environ, arguments: Sequence[str] | None = None
+) -> Launch | None:
+    """Return the launch and training that this process belongs to, None if nothing would restart it.
 
-    `PENUMBRA_LAUNCH` names one; otherwise torchrun's `--rdzv-id`, or on one machine its process; otherwise
-    the job of Slurm.
+    `PENUMBRA_LAUNCH` names a launch; otherwise torchrun's `--rdzv-id`; otherwise the job of Slurm; otherwise,
+    on one machine, the process of torchrun.
+
+    Args:
+        environment: Variables of this process.
+        arguments: Its command line without the program, that of `sys.argv` where None.
     """
-    named = environment.get(LAUNCH_VARIABLE)
-    if named:
-        return Launch(named, unfinished=True)
+    if training := environment.get(TRAINING_VARIABLE):
+        return Launch(training, unfinished=True)
+    what = _digest(sys.argv[1:] if arguments is None else arguments)
+    if named := environment.get(LAUNCH_VARIABLE):
+        return Launch(f"{named} {what}", unfinished=True)
     restarts = environment.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
     torchrun = environment.get("TORCHELASTIC_RUN_ID")
     if torchrun and torchrun != "none":  # its default
-        return Launch(f"torchrun {torchrun}", restarts, unfinished=True)
-    if torchrun and environment.get("WORLD_SIZE") == environment.get("LOCAL_WORLD_SIZE"):
+        return Launch(f"torchrun {torchrun} {what}", restarts, unfinished=True)
+    if "SLURM_JOB_ID" in environment:
+        restarts = restarts or environment.get("SLURM_RESTART_COUNT", "0") != "0"
+        return Launch(f"slurm {environment['SLURM_JOB_ID']} {what}", restarts)
+    if torchrun and environment.get("WORLD_SIZE") != environment.get("LOCAL_WORLD_SIZE"):
+        if environment.get("RANK") == "0":
+            _warn_of_nameless_launch()
+        return None
+    if torchrun:
         import psutil
 
         agent = psutil.Process(os.getppid())
-        return Launch(f"torchrun {socket.gethostname()} {agent.pid} {agent.create_time():.2f}", restarts)
-    if "SLURM_JOB_ID" in environment:
-        again = environment.get("SLURM_RESTART_COUNT", "0") != "0"
-        return Launch(f"slurm {environment['SLURM_JOB_ID']}", again)
+        place = f"{socket.gethostname()} {agent.pid} {agent.create_time():.2f}"
+        return Launch(f"torchrun {place} {what}", restarts)
     return None
+
+
+def _digest(arguments: Sequence[str]) -> str:
+    """Return what stands for a command line, the same on machines with other places of installation."""
+    line = json.dumps([argument.replace(str(configs.folder()), "") for argument in arguments])
+    return hashlib.sha256(line.encode()).hexdigest()[:12]
+
+
+@functools.cache  # once
+def _warn_of_nameless_launch() -> None:
+    print(
+        "this torchrun on several machines has no --rdzv-id, so that a restart would begin a new run; give "
+        f"it one, or set {LAUNCH_VARIABLE} to the same name on all machines",
+        file=sys.stderr,
+    )
 
 
 def begin_launch(folder: Path, launch: Launch, checkpoint: str | None = None) -> None:

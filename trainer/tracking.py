@@ -23,8 +23,9 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from trainer.runs import RUN_FILE, RunRecord, new_folder
 from trainer.spool.delivery import LIMITS
-from trainer.spool.journal import Event, Journal, Recorded, number
+from trainer.spool.journal import Event, Journal, number
 from trainer.spool.machine import Sampler
+from trainer.spool.recorded import Recorded
 from trainer.spool.sender import Sender, wait_for
 from trainer.spool.store import (
     described,
@@ -236,8 +237,13 @@ class MLflowTracking(Logger):
         if not self._recorded.has(event):
             self._append(event | self._opened().keep(path))
 
-    def after_save_checkpoint(self, checkpoint_callback: Any) -> None:
-        """Write down what waits for disk space, since the run would continue behind it."""
+    @rank_zero_only
+    def before_checkpoint(self) -> None:
+        """Write down what waits for disk space: a run that continues from the checkpoint would lack it.
+
+        Raises:
+            OSError: There is no space; the checkpoint must not be saved.
+        """
         if self._journal is not None and not self._journal.flush():
             raise OSError(
                 f"cannot write {self._journal.path}: the disk is full; continue with --ckpt_path last"

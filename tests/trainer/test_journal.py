@@ -8,8 +8,8 @@ import time
 import pytest
 
 from trainer.spool import journal as module
-from trainer.spool.journal import Clock, Journal, Recorded, events
-from trainer.tracking import MLflowTracking
+from trainer.spool.journal import Clock, Journal, events
+from trainer.spool.recorded import Recorded
 
 
 def metrics(step, **values):
@@ -101,25 +101,6 @@ def test_another_error_of_the_disk_is_one_line_that_names_the_journal(tmp_path, 
     monkeypatch.setattr(module.os, "write", broken)
     with pytest.raises(OSError, match=r"cannot write .*journal.jsonl: Input/output error"):
         journal.append(metrics(0))
-
-
-@pytest.mark.usefixtures("workplace", "quick_sending")
-def test_checkpoint_beyond_what_could_be_recorded_ends_the_run_with_a_message(monkeypatch, capsys):
-    log = MLflowTracking("exp", system_metrics=False)
-    log.log_metrics({"loss": 1.0}, step=0)
-    log.flush()
-    disk = Disk(monkeypatch, 0)
-    log.log_metrics({"loss": 0.9}, step=1)
-    with pytest.raises(OSError, match="the disk is full; continue with --ckpt_path last"):
-        log.after_save_checkpoint(None)
-    log.finalize("failed")
-    assert "2 events" in capsys.readouterr().err
-    disk.space = 1 << 20
-    again = MLflowTracking("exp", system_metrics=False, resume_from=str(log.folder))
-    for step in (1, 2):
-        again.log_metrics({"loss": 0.9}, step=step)
-    again.finalize("success")
-    assert [event["step"] for event, _ in events(log.folder) if event["type"] == "metrics"] == [0, 1, 2]
 
 
 def test_clock_follows_time_and_never_goes_back(monkeypatch):

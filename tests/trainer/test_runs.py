@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from trainer import configs, runs
 from trainer.runs import (
     Launch,
     RunRecord,
@@ -127,19 +128,77 @@ def test_damaged_note_of_a_launch_is_no_launch(tmp_path):
     assert run_of_launch(Launch("a", restarts=True), tmp_path, "exp") is None
 
 
+TORCHRUN = {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_RESTART_COUNT": "0", "WORLD_SIZE": "2", "RANK": "0"}
+
+
+def launch(*arguments, **environment):
+    found = current_launch(environment, arguments)
+    return found and (found.identity.rsplit(" ", 1)[0], found.restarts, found.unfinished)
+
+
 def test_launch_is_named_by_variable_torchrun_or_slurm():
-    assert current_launch({}) is None
-    assert current_launch({"PENUMBRA_LAUNCH": "x", "SLURM_JOB_ID": "7"}) == Launch("x", unfinished=True)
+    assert launch() is None
+    assert launch(PENUMBRA_LAUNCH="x", SLURM_JOB_ID="7") == ("x", False, True)
     torchrun = {"TORCHELASTIC_RUN_ID": "job", "TORCHELASTIC_RESTART_COUNT": "2"}
-    assert current_launch(torchrun) == Launch("torchrun job", restarts=True, unfinished=True)
-    assert current_launch({"SLURM_JOB_ID": "7"}) == Launch("slurm 7")
-    assert current_launch({"SLURM_JOB_ID": "7", "SLURM_RESTART_COUNT": "1"}) == Launch("slurm 7", True)
+    assert launch(**torchrun, SLURM_JOB_ID="7") == ("torchrun job", True, True)
+    assert launch(SLURM_JOB_ID="7") == ("slurm 7", False, False)
+    assert launch(SLURM_JOB_ID="7", SLURM_RESTART_COUNT="1") == ("slurm 7", True, False)
 
 
-def test_torchrun_without_an_identity_is_known_by_its_process_on_one_machine_only():
-    one = {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_RESTART_COUNT": "0", "WORLD_SIZE": "2"}
-    launch = current_launch({**one, "LOCAL_WORLD_SIZE": "2"})
-    assert launch == current_launch({**one, "LOCAL_WORLD_SIZE": "2"})
-    assert not launch.restarts
-    assert not launch.unfinished
-    assert current_launch({**one, "LOCAL_WORLD_SIZE": "1"}) is None
+def test_torchrun_without_an_identity_in_a_job_of_slurm_has_that_of_the_job():
+    for local in ("1", "2"):
+        nameless = TORCHRUN | {"LOCAL_WORLD_SIZE": local, "SLURM_JOB_ID": "7"}
+        assert launch(**nameless) == ("slurm 7", False, False)
+        assert launch(**nameless | {"TORCHELASTIC_RESTART_COUNT": "1"}) == ("slurm 7", True, False)
+        assert launch(**nameless | {"SLURM_RESTART_COUNT": "1"}) == ("slurm 7", True, False)
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"PENUMBRA_LAUNCH": "x"},
+        {"TORCHELASTIC_RUN_ID": "job"},
+        TORCHRUN | {"LOCAL_WORLD_SIZE": "2"},
+        {"SLURM_JOB_ID": "7"},
+    ],
+)
+def test_trainings_of_one_launch_are_told_apart_by_their_command_lines(environment):
+    first = current_launch(environment, ["fit", "--config", "a.yaml"])
+    assert first == current_launch(environment, ["fit", "--config", "a.yaml"])
+    assert first.identity != current_launch(environment, ["fit", "--config", "b.yaml"]).identity
+    assert first.identity != current_launch(environment, ["fit", "--config a.yaml"]).identity
+
+
+def test_place_of_installation_does_not_matter_to_a_launch(tmp_path, monkeypatch):
+    def resolved(name, place):
+        monkeypatch.setattr(configs, "folder", lambda: place)
+        return current_launch({"PENUMBRA_LAUNCH": "x"}, ["fit", f"--config={place / name}"])
+
+    one = resolved("wskp.yaml", tmp_path / "a")
+    assert resolved("wskp.yaml", tmp_path / "b") == one
+    assert resolved("kpcn.yaml", tmp_path / "b") != one
+
+
+def test_named_training_is_the_same_whatever_its_command_line():
+    environment = {"PENUMBRA_TRAINING": "submit 1", "PENUMBRA_LAUNCH": "x", "TORCHELASTIC_RUN_ID": "job"}
+    for arguments in ([], ["fit", "--config", "scratch/a.yaml"]):
+        assert current_launch(environment, arguments) == Launch("submit 1", unfinished=True)
+
+
+def test_torchrun_without_an_identity_is_known_by_its_process_on_one_machine_only(capsys):
+    one = launch(**TORCHRUN, LOCAL_WORLD_SIZE="2")
+    assert one == launch(**TORCHRUN, LOCAL_WORLD_SIZE="2")
+    assert one[1:] == (False, False)
+    assert capsys.readouterr().err == ""
+
+
+def test_torchrun_without_an_identity_on_several_machines_says_once_what_to_do(capsys):
+    runs._warn_of_nameless_launch.cache_clear()
+    assert launch(**TORCHRUN | {"RANK": "1"}, LOCAL_WORLD_SIZE="1") is None
+    assert capsys.readouterr().err == ""
+    for _ in range(2):
+        assert launch(**TORCHRUN, LOCAL_WORLD_SIZE="1") is None
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "--rdzv-id" in said
+    assert "PENUMBRA_LAUNCH" in said

@@ -15,6 +15,7 @@ from tests.tracking_server import free_port
 from tests.trainer.test_tracking import (
     assert_complete,
     continued,
+    files,
     history,
     killed,
     logger,
@@ -26,8 +27,10 @@ from trainer.configs import UsageError
 from trainer.export import export
 from trainer.export.register import weights_of
 from trainer.runs import RunRecord
-from trainer.spool.delivery import Sent, left
+from trainer.spool import journal, past
+from trainer.spool.journal import Journal, events
 from trainer.spool.sender import Lock
+from trainer.spool.sent import Backlog, Sent, left
 from trainer.spool.store import unreachable
 from trainer.tracking import MLflowTracking, open_client
 
@@ -60,7 +63,9 @@ def unsent(uri):
 def test_sync_sends_what_is_left_once_and_says_so(proxy, capsys):
     log = unsent(proxy.uri)
     assert synced(log.folder) == 1
-    assert "events are left. The tracking server" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "events are left. The tracking server" in said
+    assert "sent" not in said
     proxy.start()
     assert synced(log.folder) == 0
     said = capsys.readouterr().out
@@ -113,6 +118,24 @@ def test_lock_is_free_once_it_is_released_even_if_a_forked_process_lives_on(prox
     finally:
         os.close(writing)
         os.waitpid(child, 0)
+
+
+def test_backlog_is_counted_by_reading_every_line_once(tmp_path, monkeypatch):
+    RunRecord("exp", "run", "sqlite:///x", "id").save(tmp_path)
+    log, lines, parsed = Journal(tmp_path), [], journal.parsed
+    monkeypatch.setattr(journal, "parsed", lambda line: lines.append(line) or parsed(line))
+    backlog = Backlog(tmp_path)
+    for step in range(4):
+        log.append({"type": "metrics", "step": step, "values": {}})
+    assert (backlog(), len(lines)) == (4, 4)
+    ends = [offset for _, offset in events(tmp_path)]
+    lines.clear()
+    Sent("id", ends[1]).save(tmp_path)
+    assert (backlog(), lines) == (2, [])
+    log.append({"type": "metrics", "step": 4, "values": {}})
+    assert (backlog(), len(lines)) == (3, 1)
+    Sent("id", journal.journal_size(tmp_path)).save(tmp_path)
+    assert (backlog(), len(lines)) == (0, 1)
 
 
 def test_sync_of_nothing_asks_for_runs_and_of_another_folder_says_that_it_is_none(workplace):
@@ -168,12 +191,18 @@ def test_upload_moves_a_local_run_to_the_server_with_everything(proxy, capsys):
     assert "is tracked by" in capsys.readouterr().out
 
 
-def test_upload_of_a_run_from_before_the_journal_sends_what_its_store_holds(proxy):
+def old_run():
+    """A run as it was left before there were journals: its local store holds everything."""
     log = logger()
     record_all(log)
     log.finalize("success")
-    record = log.record
     shutil.rmtree(log.folder / "spool")
+    return log
+
+
+def test_upload_of_a_run_from_before_the_journal_sends_what_its_store_holds(proxy):
+    log = old_run()
+    record = log.record
     # as it was left by a version that went on with the local store when a server broke away
     server = open_client(proxy.start().uri)
     begun = server.create_run(server.create_experiment(record.experiment), run_name=record.name).info.run_id
@@ -182,6 +211,63 @@ def test_upload_of_a_run_from_before_the_journal_sends_what_its_store_holds(prox
     assert uploaded(log.folder) == 0
     assert log.run_id == begun
     assert_complete(log)
+
+
+class KilledError(BaseException):
+    """Stands in for SIGKILL."""
+
+
+@pytest.mark.parametrize("moment", ["_write_metrics", "_write_artifacts", "_write_models", "save"])
+def test_upload_of_a_run_from_before_the_journal_can_be_repeated_after_a_kill(proxy, monkeypatch, moment):
+    def killed_here(*arguments):
+        raise KilledError
+
+    log = old_run()
+    proxy.start()
+    with monkeypatch.context() as patch:
+        patch.setattr(RunRecord if moment == "save" else past, moment, killed_here)
+        with pytest.raises(KilledError):
+            uploaded(log.folder, proxy.uri)
+    assert log.uri.startswith("sqlite:")
+    assert uploaded(log.folder, proxy.uri) == 0
+    assert_complete(log)
+
+
+def test_upload_of_a_continued_run_from_before_the_journal_keeps_its_beginning(proxy):
+    old = old_run()
+    log = continued(old)
+    log.log_metrics({"loss": 0.2}, step=2)
+    log.log_params({"lr": 0.1})
+    log.log_text("seed: 2\n", "config-resumed-1.yaml")
+    log.finalize("failed")
+    proxy.start()
+    assert uploaded(log.folder, proxy.uri) == 0
+    run = stored(log)
+    assert history(log, "loss") == [(0, 1.0), (1, 0.5), (2, 0.2)]
+    assert (run.data.params, run.data.tags["note"], run.info.status) == ({"lr": "0.1"}, "x", "FAILED")
+    assert files(log) == ["config-resumed-1.yaml", "config.yaml", "images"]
+    assert not (log.folder / "spool" / "rejected.jsonl").exists()
+
+
+def test_upload_of_an_evaluated_run_from_before_the_journal_keeps_the_status_of_its_training(proxy):
+    log = continued(old_run(), evaluation=True)
+    log.log_metrics({"test/psnr": 30.0}, step=1)
+    log.finalize("failed")
+    proxy.start()
+    assert uploaded(log.folder, proxy.uri) == 0
+    assert stored(log).data.metrics["test/psnr"] == 30.0
+    assert_complete(log)
+
+
+def test_upload_of_an_old_run_whose_store_is_gone_says_so_and_changes_nothing(proxy):
+    log = old_run()
+    record = log.record
+    record.run_id = "0" * 32
+    record.save(log.folder)
+    proxy.start()
+    with pytest.raises(ValueError, match=r"cannot be read from the tracking store .* nothing was sent"):
+        uploaded(log.folder, proxy.uri)
+    assert RunRecord.load(log.folder) == record
 
 
 def test_upload_to_an_unreachable_server_fails_and_changes_nothing():
@@ -206,7 +292,7 @@ def test_upload_of_a_run_that_is_being_trained_is_refused(proxy):
     log = logger()
     log.log_metrics({"loss": 1.0}, step=0)
     log.flush()
-    with pytest.raises(ValueError, match="is being trained"):
+    with pytest.raises(ValueError, match=r"another process sends .*: its training"):
         uploaded(log.folder, proxy.start().uri)
     killed(log)
 

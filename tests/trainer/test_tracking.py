@@ -1,6 +1,10 @@
 """Runs arrive whole in their tracking store, whatever the store does meanwhile."""
 
+import errno
 import json
+import os
+import shutil
+import threading
 import time
 import uuid
 from types import SimpleNamespace
@@ -10,9 +14,10 @@ from lightning.pytorch.utilities import rank_zero_only
 from PIL import Image
 
 from trainer.runs import RunRecord, new_folder
-from trainer.spool.delivery import Sent
+from trainer.spool import machine, store
 from trainer.spool.journal import events
 from trainer.spool.machine import Sampler
+from trainer.spool.sent import Sent
 from trainer.tracking import MLflowTracking, open_client, tracking_uri
 
 pytestmark = pytest.mark.usefixtures("workplace", "quick_sending")
@@ -78,6 +83,28 @@ def test_local_store_needs_no_server_and_holds_everything_at_the_end(workplace):
     assert_complete(log)
     artifacts = workplace / "runs" / "artifacts" / log.experiment_name / log.run_id / "artifacts"
     assert (artifacts / "config.yaml").is_file()
+
+
+def test_local_store_is_made_on_a_file_system_without_links(tmp_path, monkeypatch, empty_store):
+    def no_links(source, target):
+        raise OSError(errno.EPERM, "no links")
+
+    class Store:
+        """Makes a database as MLflow does, at once."""
+
+        engine = SimpleNamespace(dispose=lambda: None)
+
+        def __init__(self, uri, artifacts):
+            shutil.copy(empty_store, uri.removeprefix("sqlite:///"))
+
+    monkeypatch.setattr("mlflow.store.tracking.sqlalchemy_store.SqlAlchemyStore", Store)
+    monkeypatch.setattr(os, "link", no_links)
+    store._make_database(tmp_path / "new.db")
+    assert (tmp_path / "new.db").read_bytes() == empty_store.read_bytes()
+    (tmp_path / "new.db").write_bytes(b"of another run that was faster")
+    store._make_database(tmp_path / "new.db")
+    assert (tmp_path / "new.db").read_bytes() == b"of another run that was faster"
+    assert not list(tmp_path.glob(".new.db*"))
 
 
 def test_run_folder_and_record_are_there_before_any_server_answers(proxy):
@@ -394,8 +421,6 @@ def test_clock_that_is_set_back_or_forth_never_turns_the_order(monkeypatch):
 
 
 def test_machine_is_sampled_into_the_journal_and_its_steps_go_on_after_a_kill(monkeypatch):
-    from trainer.spool import machine
-
     monkeypatch.setattr(machine, "INTERVAL_S", 0.05)
     key = "system/system_memory_usage_percentage"
     log = logger(system_metrics=True)
@@ -421,11 +446,14 @@ def wait_for_samples(log, key, count):
     raise AssertionError("the machine is not sampled")
 
 
-def test_sampler_stops_at_once():
+def test_sampler_stops_without_waiting_for_the_next_sample(monkeypatch):
+    monkeypatch.setattr(machine, "INTERVAL_S", 3600.0)
     sampler = Sampler(lambda numbers, step: None, 0)
     sampler.start()
-    sampler.stop()
-    assert not sampler.is_alive()
+    stopping = threading.Thread(target=sampler.stop, daemon=True)
+    stopping.start()
+    stopping.join(timeout=60)
+    assert not stopping.is_alive()
 
 
 def test_other_ranks_record_nothing(workplace, monkeypatch):
@@ -433,7 +461,7 @@ def test_other_ranks_record_nothing(workplace, monkeypatch):
     log = logger()
     record_all(log)
     log.log_file(workplace / "absent")
-    log.after_save_checkpoint(SimpleNamespace())
+    log.before_checkpoint()
     log.finalize("success")
     assert [path.name for path in (workplace / "runs").iterdir()] == ["mlflow.db"]
 

@@ -86,8 +86,28 @@ class LastCheckpoint(_RunCheckpoint):
             enable_version_counter=False, auto_insert_metric_name=False,
         )  # fmt: skip
 
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save where that is due, unless a validation follows.
+
+        A run that continues from a checkpoint before a validation would leave the validation out.
+        """
+        if not trainer.fit_loop.epoch_loop._should_check_val_fx(trainer.fit_loop._data_fetcher):  # type: ignore[arg-type]
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save what was due before the validation."""
+        super().on_validation_end(trainer, pl_module)
+        due = trainer.global_step % self._every_n_train_steps == 0
+        if due and not self._should_skip_saving_checkpoint(trainer):
+            self._save(trainer)
+
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the end of training, whatever the interval."""
         super().on_train_end(trainer, pl_module)
         if self._last_global_step_saved != trainer.global_step:
-            self._save_checkpoint(trainer, os.path.join(self.dirpath or ".", "last.ckpt"))
+            self._save(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        self._save_checkpoint(trainer, os.path.join(self.dirpath or ".", "last.ckpt"))

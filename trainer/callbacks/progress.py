@@ -68,7 +68,6 @@ class TrainingProgress(ProgressBar):
         self._traffic: tuple[float, float] | None = None  # MB/s read and downloaded, of shards at a URL
         self._loss: float | None = None
         self._gap: float | None = None
-        self._paused_s = 0.0
 
     def disable(self) -> None:
         """Show nothing (Lightning calls this on all ranks but the first)."""
@@ -83,7 +82,7 @@ class TrainingProgress(ProgressBar):
         self._started = self._printed = time.monotonic()
         self._first_step = trainer.global_step
         self._mark = _Mark(self._started, 0, waited(trainer), *traffic(trainer))
-        self._patches, self._paused_s = 0, 0.0
+        self._patches = 0
         if self._enabled and sys.stderr.isatty():
             self._bar = Progress(
                 TextColumn("[bold]{task.description}"), BarColumn(bar_width=24),
@@ -117,7 +116,6 @@ class TrainingProgress(ProgressBar):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print the validation score of the epoch."""
         pause = time.monotonic() - self._validation_began
-        self._paused_s += pause
         self._mark = self._mark._replace(time=self._mark.time + pause)
         if self._enabled and not trainer.sanity_checking and trainer.state.fn == "fit":
             self._line(f"epoch {trainer.current_epoch}: {self._scores(trainer)}")

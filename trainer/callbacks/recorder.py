@@ -14,6 +14,7 @@ import yaml
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.cli import SaveConfigCallback
 
+from trainer.outputs import write_whole
 from trainer.tracking import MLflowTracking
 
 PACKAGES = ("penumbra-denoise", "torch", "lightning", "mlflow", "numpy", "torchmetrics", "jsonargparse",
@@ -39,6 +40,26 @@ class RunRecorder(SaveConfigCallback):
         tags["parameters"] = str(sum(p.numel() for p in pl_module.parameters() if p.requires_grad))
         logger.set_tags(tags)
 
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Record what lies before a checkpoint before it is saved.
+
+        A run that continues from it does not take these steps again. Lightning saves after a step before it
+        logs what the step gave, and logs that once more behind, which the tracking knows.
+
+        Raises:
+            OSError: The disk is full.
+        """
+        logger = trainer.logger
+        if not trainer.is_global_zero or not isinstance(logger, MLflowTracking):
+            return
+        batches: Any = trainer.fit_loop.epoch_loop.batch_progress.current  # declared without `processed`
+        numbers = trainer._logger_connector
+        if batches.processed > batches.completed and numbers._first_loop_iter is not None:  # behind a step
+            numbers.update_train_step_metrics()
+        logger.before_checkpoint()
+
     def _keep(self, logger: MLflowTracking, text: str, changes: dict[str, tuple[str, str]]) -> None:
         """Keep the configuration, and say what is not as it was when the run began.
 
@@ -47,7 +68,7 @@ class RunRecorder(SaveConfigCallback):
         name = config_name(logger.folder)
         if name != "config.yaml" and same_configuration(logger.folder, text):
             return
-        (logger.folder / name).write_text(text)
+        write_whole(logger.folder / name, text)
         logger.log_text(text, name)
         if changes:
             lines = [f"{key}: {first} → {now}" for key, (first, now) in changes.items()]

@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _has_left(folder: Path) -> bool:
     """Return whether a run has something left, or is so damaged that `_sent` has to tell."""
-    from trainer.spool.delivery import left
+    from trainer.spool.sent import left
 
     try:
         return left(folder) > 0
@@ -69,8 +69,9 @@ def _sent(folder: Path) -> int:
 
 def send(folder: Path) -> int:
     """Send what is left of one run and print it; returns 1 where something still is."""
-    from trainer.spool.delivery import Delivery, left
+    from trainer.spool.delivery import Delivery
     from trainer.spool.sender import Lock
+    from trainer.spool.sent import left
     from trainer.spool.store import load_mlflow, quiet_mlflow
 
     waiting = left(folder)
@@ -91,8 +92,9 @@ def send(folder: Path) -> int:
     finally:
         lock.release()
     rest = left(folder)
-    counts = f"{delivery.counts['metrics']} metric values and {delivery.counts['files']} files"
-    print(f"{folder}: sent {counts} to {delivery.uri}, run {delivery.record.run_id}")
+    if rest < waiting:
+        counts = f"{delivery.counts['metrics']} metric values and {delivery.counts['files']} files"
+        print(f"{folder}: sent {counts} to {delivery.uri}, run {delivery.record.run_id}")
     if delivery.sent.rejected:
         print(f"{folder}: {delivery.sent.rejected} were refused; see {folder / 'spool' / 'rejected.jsonl'}")
     if rest:
@@ -102,7 +104,7 @@ def send(folder: Path) -> int:
 
 def _send(delivery: Delivery, waiting: int) -> str:
     """Send everything; returns what keeps the rest from being sent."""
-    from data.shards.progress import LineProgress
+    from data.progress import LineProgress
     from trainer.spool.failures import Kind, OutageError
     from trainer.spool.sender import trouble
 

@@ -30,10 +30,10 @@ def run(arguments: argparse.Namespace) -> int:
         ValueError: The folder is no run, no server is named, or it does not answer.
     """
     from trainer.commands.sync import send
-    from trainer.spool.delivery import left
-    from trainer.spool.journal import JOURNAL, SPOOL
-    from trainer.spool.past import write_journal
+    from trainer.spool.journal import SPOOL
+    from trainer.spool.past import is_whole, write_journal
     from trainer.spool.sender import Lock
+    from trainer.spool.sent import left
     from trainer.spool.store import is_server, unreachable
 
     folder: Path = arguments.run
@@ -51,9 +51,11 @@ def run(arguments: argparse.Namespace) -> int:
     (folder / SPOOL).mkdir(exist_ok=True)
     lock = Lock(folder)
     if not lock.acquire():
-        raise ValueError(f"{folder} is being trained; nothing was sent")
+        raise ValueError(
+            f"another process sends {folder}: its training, or `trainer sync`; try again when that has ended"
+        )
     try:
-        if not (folder / SPOOL / JOURNAL).exists():
+        if not is_whole(folder):
             write_journal(folder)
         record.tracking_uri, record.run_id = target, record.server_run_id
         record.unreached_uri = record.server_run_id = None

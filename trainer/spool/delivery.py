@@ -1,4 +1,4 @@
-"""Brings the journal of a run to its tracking store, in order, and remembers how far it is.
+"""Brings the journal of a run to its tracking store, in order.
 
 Everything can be sent twice: a metric has the time of its recording, and the store ignores one that it has
 with the same key, step, time and value; parameters keep their first value; tags and files are replaced; runs
@@ -8,17 +8,16 @@ and models are looked for before they are made.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from trainer.runs import RunRecord
 from trainer.spool.failures import Kind, OutageError, RefusedError, classify, reason
-from trainer.spool.journal import SPOOL, Event, events, shown
+from trainer.spool.journal import SPOOL, Event, events, journal_size, shown
+from trainer.spool.sent import Sent
 from trainer.spool.store import described, experiment_id, open_client
 
 if TYPE_CHECKING:
@@ -33,49 +32,6 @@ BATCHES = {"params": 50, "tags": 50, "metrics": 500}
 """How many a request takes, well below MLflow's limits on their number and on its size."""
 LIMITS = {"params": 6000, "tags": 8000}
 """Longest values that a store takes, in characters."""
-
-
-@dataclass
-class Sent:
-    """How far a journal was delivered, kept in `spool/sent.json`.
-
-    Attributes:
-        run_id: Run that took it.
-        offset: Bytes of the journal that were sent.
-        created: Whether the run was made for this journal, rather than found in an old record.
-        rejected: Number of entries that the store refused.
-    """
-
-    run_id: str | None = None
-    offset: int = 0
-    created: bool = False
-    rejected: int = 0
-
-    @classmethod
-    def load(cls, folder: Path) -> Sent:
-        """Return the state of a run folder, that of nothing sent where it is absent or damaged."""
-        try:
-            return cls(**json.loads((folder / SPOOL / "sent.json").read_text()))
-        except (OSError, ValueError, TypeError):
-            return cls()
-
-    def save(self, folder: Path) -> None:
-        """Write it whole or not at all; on a full disk not, after which some is sent again."""
-        path = folder / SPOOL / "sent.json"
-        partial = path.with_suffix(f".{os.getpid()}.tmp")
-        try:
-            partial.write_text(json.dumps(asdict(self)) + "\n")
-            os.replace(partial, path)
-        except OSError:
-            partial.unlink(missing_ok=True)
-
-
-def left(folder: Path) -> int:
-    """Return how many events of a run's journal the store does not have yet."""
-    sent = Sent.load(folder)
-    if sent.run_id != RunRecord.load(folder).run_id:
-        return sum(1 for _ in events(folder))
-    return sum(1 for _ in events(folder, sent.offset))
 
 
 class Delivery:
@@ -120,8 +76,7 @@ class Delivery:
 
     def _resize(self) -> None:
         """Begin anew where the journal is not the one that was sent."""
-        path = self.folder / SPOOL / "journal.jsonl"
-        if self.sent.offset and (not path.exists() or path.stat().st_size < self.sent.offset):
+        if journal_size(self.folder) < self.sent.offset:
             self.sent.offset = 0
 
     def _next(self) -> list[tuple[Event, int]]:

@@ -11,16 +11,18 @@ import time
 from pathlib import Path
 
 from trainer.progress import duration
-from trainer.spool.delivery import Delivery, left
+from trainer.spool.delivery import Delivery
 from trainer.spool.failures import Kind, OutageError, reason
 from trainer.spool.journal import SPOOL, Journal, shown
+from trainer.spool.sent import Backlog
 from trainer.spool.store import described, is_server
 
 INTERVAL_S = 5.0
-"""Between two groups while training runs: rare enough to cost it nothing, often enough to watch."""
+"""Until the next look where there was nothing to send: rare enough to cost nothing, often enough to watch."""
 REST = 50
-"""Rest after a group, in times of the processor time that it took: at most two hundredths of a core go into
-sending while training runs, also when hours are made up for."""
+"""Rest after a group, in times of the processor time that it took: two hundredths of a core go into sending
+while training runs, also when hours are made up for. Only a group that takes more than 0.4 s of it, such as
+the registration of a model, has a larger share, for that once."""
 LONGEST_REST_S = 20.0
 LONGEST_WAIT_S = 60.0
 PATIENCE_S = 10.0
@@ -87,7 +89,7 @@ def trouble(outage: OutageError, uri: str) -> str:
 class Sender(threading.Thread):
     """Sends a journal until it is stopped, and tries again after failures.
 
-    It is a thread and not a process: the time that it needs is bounded by `REST`, and a process would load
+    It is a thread and not a process: `REST` keeps the time small that it takes, and a process would load
     another PyTorch and MLflow, some hundred megabytes, to save two hundredths of a core.
 
     Args:
@@ -129,7 +131,8 @@ class Sender(threading.Thread):
         self._last_success, self._hurry = begin, True
         self._backoff.reset()
         self._wake.set()
-        rest = left(self.folder)
+        backlog = Backlog(self.folder)
+        rest = backlog()
         while rest and self.is_alive():
             now = time.monotonic()
             if now - begin > wait_s or (self._useless(begin) and not self._busy):
@@ -140,7 +143,7 @@ class Sender(threading.Thread):
                 limit = duration(max(wait_s - (now - begin), 0))
                 self._delivery.say(f"{doing} {self._delivery.uri}: {rest} events left, at most {limit}")
             self._over.wait(0.05)
-            rest = left(self.folder)
+            rest = backlog()
         self._hurry = False
         return rest
 

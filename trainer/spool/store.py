@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import threading
@@ -115,8 +114,13 @@ def _make_database(path: Path) -> None:
     try:
         store = SqlAlchemyStore(f"sqlite:///{partial}", "./mlruns")  # of the experiment "Default", never used
         store.engine.dispose()
-        with contextlib.suppress(FileExistsError):  # another run was faster
+        try:
             os.link(partial, path)
+        except FileExistsError:
+            pass  # another run was faster
+        except OSError:  # a file system without links
+            if not path.exists():
+                os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 
