@@ -196,11 +196,17 @@ def facts_of(loaded: Loaded) -> dict[str, Any]:
     from models.denoiser import Denoiser
 
     model, source = loaded.model, loaded.source
-    known = isinstance(model, Denoiser)
+    facts: dict[str, Any] = {"parameters": None, "deployed": None}
+    if isinstance(model, Denoiser):
+        networks = {"parameters": model, "deployed": loaded.deployed}
+        facts = {
+            name: sum(p.numel() for p in net.parameters())
+            for name, net in networks.items()
+            if isinstance(net, Denoiser)
+        }
     return {
+        **facts,
         "class": type(model).__name__ if isinstance(model, Denoiser) else model.description.model,
-        "parameters": sum(p.numel() for p in model.parameters()) if known else None,
-        "deployed": sum(p.numel() for p in loaded.deployed.parameters()) if known else None,
         "inputs": list(model.inputs),
         "options": source.init_args,
         "sha256": source.sha256,
@@ -211,8 +217,8 @@ def main() -> int:
     """Read a task, do it; returns the exit status."""
     import torch
 
-    given = json.loads(sys.stdin.readline())
-    task = Task(**{k: tuple(v) if isinstance(v, list) else v for k, v in given.items()})
+    given: dict[str, Any] = json.loads(sys.stdin.readline())
+    task = Task(**{**given, "options": tuple(given["options"])})
     if task.threads:
         torch.set_num_threads(task.threads)
     worker = Worker(task, sys.stdin, sys.stdout)

@@ -67,8 +67,9 @@ def flip_ldr_map(output: Tensor, reference: Tensor, pixels_per_degree: float = P
         pixels_per_degree: Of the screen as the viewer sees it.
     """
     first, second = (_opponent(_clean(image).clamp(0, 1)) for image in (output, reference))
-    color = _color_error(*(_perceived(image, pixels_per_degree) for image in (first, second)))
-    feature = _feature_error(*((image[:, 0] + 16) / 116 for image in (first, second)), pixels_per_degree)
+    ppd = pixels_per_degree
+    color = _color_error(_perceived(first, ppd), _perceived(second, ppd))
+    feature = _feature_error((first[:, 0] + 16) / 116, (second[:, 0] + 16) / 116, ppd)
     return color.pow(1 - feature)
 
 
