@@ -12,6 +12,7 @@ from data.buffers import SAMPLES, buffer
 from data.frames import FrameSet
 from data.manifest import load_manifest
 from data.needs import beside, explain_lacking, patch_number
+from data.progress import LineProgress
 from data.root import Root, resolve_root
 from data.shards.batch import Batches, available
 from data.shards.cache import ShardCache
@@ -19,7 +20,6 @@ from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
 from data.shards.options import recipe_options
 from data.shards.prepare import cached_path, prepare_cached
-from data.shards.progress import LineProgress
 from data.shards.read import CorruptSampleError, Sample, ShardReader
 
 Loader = TrainingLoader | EvaluationLoader

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from data.remote_failures import ContentError
-from data.remote_patience import patiently, shown
+from data.remote_patience import NoBucketError, patiently, shown
 from data.remote_systems import counter, http_delete, http_range, inner, is_http, run, system_of
 
 SCHEMES = ("s3", "http", "https", "memory", "file")
@@ -201,13 +201,13 @@ def exists(url: str) -> bool:
     """Return whether there is a file at a URL.
 
     Raises:
-        OSError: As `fetch`, except that a missing file is no error; a missing bucket may be.
+        OSError: As `fetch`, except that a missing file is no error; NoBucketError where the server tells.
     """
     try:
         size_of(url)
-    except FileNotFoundError as error:
-        if "no bucket" in str(error):
-            raise
+    except NoBucketError:
+        raise
+    except FileNotFoundError:
         return False
     return True
 
@@ -230,10 +230,15 @@ def _size(url: str) -> int | None:
     return None if found.get("size") is None else int(found["size"])
 
 
-def sha256_of(url: str) -> str | None:
+def sha256_of(url: str, size: int) -> str | None:
     """Return the checksum of a file at a URL: what S3 keeps beside it, elsewhere by reading it.
 
-    None: S3 has the file, but it was not sent by `send`.
+    Args:
+        url: Of the file.
+        size: Bytes that it should have; no more are read.
+
+    Returns:
+        None: The file is larger, or S3 has it, but it was not sent by `send`.
 
     Raises:
         OSError: As `fetch`.
@@ -242,7 +247,10 @@ def sha256_of(url: str) -> str | None:
         found: Any = patiently("read", url, lambda: system_of(url).metadata(inner(url), refresh=True))
         return {str(name).lower(): str(value) for name, value in found.items()}.get(SHA256)
     with tempfile.TemporaryDirectory(prefix="penumbra-") as folder:
-        download(url, Path(folder) / "file")
+        try:
+            download(url, Path(folder) / "file", limit=size)
+        except ValueError:
+            return None
         return file_sha256(Path(folder) / "file")
 
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import TypeVar
 from urllib.parse import urlsplit
 
+from data.progress import duration
 from data.remote_failures import ContentError, Judgement, judge
-from data.shards.progress import duration
 
 Result = TypeVar("Result")
 
@@ -27,6 +27,11 @@ CONTENT_ATTEMPTS = 3
 """Downloads of a file that arrives otherwise than it should be: waiting mends nothing there."""
 UNKNOWN_HOST_S = 20.0
 """Patience with a host whose name is not known and that this process never reached: most often a typo."""
+
+
+class NoBucketError(FileNotFoundError):
+    """The bucket of a file does not exist, where a missing file would be nothing unusual."""
+
 
 _lock = threading.Lock()
 _reached: set[str] = set()
@@ -67,7 +72,7 @@ def patiently(doing: str, url: str, attempt: Callable[[], Result]) -> Result:
         attempt: The request.
 
     Raises:
-        FileNotFoundError: There is no such file or bucket.
+        FileNotFoundError: There is no such file; NoBucketError: there is no such bucket.
         PermissionError: Credentials are missing, expired, or do not allow it.
         ConnectionError: The server gave no good answer for as long as the patience lasts.
         OSError: The server refuses the request, or this machine failed, as with a full disk.
@@ -165,7 +170,7 @@ def _final(doing: str, url: str, judged: Judgement) -> OSError:
         return FileNotFoundError(f"{what}; check the address")
     if judged.kind == "no bucket":
         bucket = urlsplit(url).netloc
-        return FileNotFoundError(
+        return NoBucketError(
             f"cannot {doing} {shown(url)}: {server} has no bucket {bucket!r}; check the name and "
             "AWS_ENDPOINT_URL, or make the bucket"
         )

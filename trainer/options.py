@@ -6,6 +6,7 @@ that a method outside of Penumbra has options without doing anything for it.
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import inspect
 import re
@@ -18,6 +19,24 @@ from trainer.configs import UsageError
 
 _WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 _SIMPLE = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}
+
+
+class AddModel(argparse.Action):
+    """`--model`, which may be repeated: begins a pair of a model and the list of its options."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        """Append the pair to the value."""
+        setattr(namespace, self.dest, [*(getattr(namespace, self.dest) or []), (values, [])])
+
+
+class AddOption(argparse.Action):
+    """`--option`, with the same `dest`: belongs to the model before it."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        """Append the option to those of the last model."""
+        if not getattr(namespace, self.dest):
+            raise argparse.ArgumentError(self, f"{values}: expected after the --model that it is for")
+        getattr(namespace, self.dest)[-1][1].append(values)
 
 
 @dataclass(frozen=True)

@@ -58,3 +58,13 @@ def replacing(target: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text whole or not at all.
+
+    Raises:
+        OSError: As `replacing`.
+    """
+    with replacing(path) as partial:
+        partial.write_text(text)

@@ -7,8 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
-from data.shards.progress import Rate, duration
+from data.alive import touch
+from data.progress import Rate, duration
 
 INTERVAL = 15.0
 """Seconds between plain lines."""
@@ -56,6 +58,7 @@ def sample_progress(title: str) -> Iterator[Callable[[int, int, str], None]]:
         task = bar.add_task("", text="")
 
         def update(done: int, total: int, label: str) -> None:
+            touch()
             bar.update(task, completed=done, total=total, text=rate.text(done, total), description=label)
 
         yield update
@@ -65,6 +68,7 @@ def _lines(title: str, rate: SampleRate) -> Callable[[int, int, str], None]:
     last = [-INTERVAL]
 
     def update(done: int, total: int, label: str) -> None:
+        touch()
         text = rate.text(done, total)
         now = time.monotonic()
         if now - last[0] >= INTERVAL or done == total:
@@ -72,6 +76,16 @@ def _lines(title: str, rate: SampleRate) -> Callable[[int, int, str], None]:
             print(f"{title}: {text} ({label})", file=sys.stderr, flush=True)
 
     return update
+
+
+class Heard(Protocol):
+    """Who is told remarks and fractions of frames."""
+
+    def say(self, text: str, kind: str = "note", /) -> None:
+        """Take a remark."""
+
+    def within(self, frames: float) -> None:
+        """Take note that the work went on by a fraction of a frame."""
 
 
 class FrameProgress:
@@ -83,15 +97,17 @@ class FrameProgress:
     Args:
         total: Number of frames.
         hint: What could make slow frames faster, empty for nothing.
+        title: What the bar says before the first frame.
+        unit: What is counted, where that is not frames.
     """
 
-    def __init__(self, total: int, hint: str = "") -> None:
+    def __init__(self, total: int, hint: str = "", title: str = "denoising", unit: str = "frame") -> None:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-        self.total, self.done, self.hint = total, 0, hint
+        self.total, self.done, self.hint, self.unit = total, 0, hint, unit
         self.start = self._told = self._begun = time.monotonic()
-        self._at = 0.0
+        self._at, self._doing = 0.0, ""
         self._said: set[str] = set()
         self._over = threading.Event()
         self._watch = threading.Thread(target=self._look, daemon=True)
@@ -106,7 +122,7 @@ class FrameProgress:
                 TimeRemainingColumn(),
             )
             self.bar = Progress(*columns, console=console)
-            self.task = self.bar.add_task("denoising", total=total, count=self._count())
+            self.task = self.bar.add_task(title, total=total, count=self._count())
 
     def __enter__(self) -> FrameProgress:
         """Show the bar."""
@@ -127,8 +143,8 @@ class FrameProgress:
         """Frames per second since the start, or seconds per frame where that is more than one."""
         seconds = max(time.monotonic() - self.start, 1e-9)
         if 0 < self.done < seconds:
-            return f"{seconds / self.done:.1f} s per frame"
-        return f"{self.done / seconds:.2f} frames/s"
+            return f"{seconds / self.done:.1f} s per {self.unit}"
+        return f"{self.done / seconds:.2f} {self.unit}s/s"
 
     def say(self, text: str, kind: str = "note", /) -> None:
         """Show a remark, once."""
@@ -139,6 +155,12 @@ class FrameProgress:
             self.bar.console.print(f"{kind}: {text}", highlight=False, markup=False, soft_wrap=True)
         else:
             print(f"{kind}: {text}", file=sys.stderr, flush=True)
+
+    def doing(self, text: str) -> None:
+        """Show what is being done within a frame."""
+        self._doing = text
+        if self.bar is not None:
+            self.bar.update(self.task, description=text)
 
     def within(self, frames: float) -> None:
         """Go on by a fraction of a frame."""
@@ -171,7 +193,9 @@ class FrameProgress:
 
     def _line(self, seconds: float) -> str:
         number = min(int(self._at) + 1, self.total)
-        text = f"frame {number}/{self.total}: {duration(seconds)} so far"
+        text = f"{self.unit} {number}/{self.total}: {duration(seconds)} so far"
+        if self._doing:
+            text += f" ({self._doing})"
         if self._at <= 0:
             return text
         left = seconds * (self.total - self._at) / self._at

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import logging
+import os
 import re
 import sys
 import warnings
@@ -16,8 +17,10 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities import rank_zero_only
 
+from data.alive import ALIVE
 from models.denoiser import Denoiser
 from trainer import configs, runs
+from trainer.callbacks.alive import Alive
 from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.recorder import RunRecorder
 from trainer.elastic import join_ranks
@@ -258,6 +261,8 @@ class TrainingCLI(LightningCLI):
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
         join_ranks(self.trainer)
+        if os.environ.get(ALIVE):
+            self.trainer.callbacks.append(Alive())  # type: ignore[attr-defined]  # Lightning types it on use
 
     def _parse_ckpt_path(self) -> None:
         """Compare the checkpoint's network, and a critic that goes on training, with the configured ones.

@@ -26,6 +26,8 @@ from data import remote
 from data.shards.index import Index, ShardRecord
 
 POLL_S = 0.05
+LOOK_AGAIN_S = 1.0
+"""Seconds after which a cache without room is looked at again: a look at some thousand files takes 30 ms."""
 FREE = 64 << 20
 """Bytes of the disk that are left free."""
 
@@ -42,15 +44,19 @@ class ShardCache:
         assert index.url is not None
         self.folder, self.url, self.limit = index.root, index.url, limit
         self._own = frozenset(f"{shard.sha256}.tar" for shard in index.shards)
+        self._begin()
+
+    def _begin(self) -> None:
         self._counting = threading.Lock()
         self._downloaded = 0
+        self._full = (0.0, 0)  # until when, for how many bytes
 
     def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_counting", "_downloaded")}
+        return {k: v for k, v in self.__dict__.items() if k not in ("_counting", "_downloaded", "_full")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._counting, self._downloaded = threading.Lock(), 0
+        self._begin()
 
     def count(self, size: int) -> None:
         """Count bytes that were downloaded."""
@@ -108,6 +114,9 @@ class ShardCache:
         path = self._path(shard)
         self.folder.mkdir(parents=True, exist_ok=True)
         while not path.is_file():
+            until, size = self._full
+            if not wanted_now and time.monotonic() < until and shard.bytes >= size:
+                return False
             with self._partial(shard) as partial:
                 if partial is None:
                     if not wanted_now:
@@ -118,6 +127,7 @@ class ShardCache:
                     return True
                 with self._alone():
                     if not self._make_room(shard.bytes, partial, wanted_now):
+                        self._full = (time.monotonic() + LOOK_AGAIN_S, shard.bytes)
                         return False
                 self._download(shard, partial)
                 os.replace(partial, path)

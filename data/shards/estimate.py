@@ -11,9 +11,9 @@ from data.buffers import SAMPLE_BUFFERS, buffer, sample_channels
 from data.frames import FrameSet
 from data.importance import PUBLISHED_SHARE
 from data.manifest import FrameRecord
+from data.progress import size_text
 from data.shards.division import Candidate, plan_shards
 from data.shards.options import PrepareOptions
-from data.shards.progress import size_text
 
 _SAMPLE_OVERHEAD = 2400
 """Bytes of a sample beside its arrays: two tar headers, the JSON and padding."""

@@ -101,8 +101,9 @@ class _Loader:
         return [Order(epoch, tuple(batch), coming) for batch, coming in zip(batches, ahead, strict=True)]
 
     def close(self) -> None:
-        """End the worker processes; iterating starts them again."""
+        """End the worker processes and what downloads ahead; iterating starts them again."""
         self._inner = None
+        self.batches.reader.close()
 
 
 class _EpochTarget(NamedTuple):

@@ -27,6 +27,7 @@ class Prefetcher:
     def __init__(self, cache: ShardCache, shards: Sequence[ShardRecord]) -> None:
         self.cache, self.shards = cache, shards
         self._failed: set[int] = set()
+        self._closed = False
         self._wanted: deque[int] = deque()
         self._change = threading.Condition()
         for number in range(THREADS):
@@ -39,11 +40,19 @@ class Prefetcher:
             self._wanted = deque(number for number in numbers if number not in self._failed)
             self._change.notify_all()
 
+    def close(self) -> None:
+        """End the threads, each after the download that it is at."""
+        with self._change:
+            self._closed = True
+            self._change.notify_all()
+
     def _work(self) -> None:
         while True:
             with self._change:
-                while not self._wanted:
+                while not (self._wanted or self._closed):
                     self._change.wait()
+                if self._closed:
+                    return
                 number = self._wanted.popleft()
             try:
                 self.cache.add(self.shards[number])

@@ -21,13 +21,13 @@ from typing import Any
 
 from data import remote
 from data.frames import FrameSet
+from data.progress import size_text
 from data.shards.division import plan_shards
 from data.shards.estimate import check_room, estimate
 from data.shards.folders import UPLOAD, cache_folder
 from data.shards.index import INDEX, Index, ShardRecord, write_json
 from data.shards.options import PrepareOptions
 from data.shards.prepare import Progress, cached_path, identity_of, prepare
-from data.shards.progress import size_text
 
 TOGETHER = 4
 """Shards that are sent at one time."""
@@ -155,7 +155,7 @@ def _may_be_there(shard: ShardRecord, there: dict[str, int] | None) -> bool:
 
 def _sent(url: str, shard: ShardRecord) -> bool:
     try:
-        return remote.sha256_of(url) == shard.sha256
+        return remote.sha256_of(url, shard.bytes) == shard.sha256
     except FileNotFoundError:
         return False
 

@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 
 from data import remote
+from data.progress import size_text
 from data.shards.cache import ShardCache
 from data.shards.description import DTYPES, Sample, parse
 from data.shards.index import Index
 from data.shards.prefetch import Prefetcher
-from data.shards.progress import size_text
 
 OPEN_FILES = 256
 """Shards mapped at one time by one process; a limit of 1024 open files is common."""
@@ -136,6 +136,12 @@ class ShardReader:
         if self._prefetcher is None:
             self._prefetcher = Prefetcher(self.cache, self.shards)
         self._prefetcher.expect(number for number in shards if number not in self._maps)
+
+    def close(self) -> None:
+        """End the threads that download ahead; the next batch starts them again."""
+        if self._prefetcher is not None:
+            self._prefetcher.close()
+            self._prefetcher = None
 
     def sample(self, number: int) -> Sample:
         """Return the description of a sample; verifies it when this process sees it for the first time.

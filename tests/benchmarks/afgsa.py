@@ -31,11 +31,11 @@ from torch import Tensor, nn
 
 from models import AFGSA
 from models.published import load_published
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.memory import peak_bytes
 from tests.benchmarks.timing import Row, medians, print_table, row
 from tests.models.frames import split_buffers
 from tests.models.plain_afgsa import PlainAFGSA
+from trainer.benchmarking.memory import reset_peak, status
 
 SIZE = 128
 Batch = Mapping[str, Tensor]

@@ -25,9 +25,9 @@ from torch import Tensor
 
 from models import AFGSA
 from models.tiling import denoise_tiled
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.timing import Row, print_table, row
 from tests.models.frames import split_buffers
+from trainer.benchmarking.memory import reset_peak, status
 
 HEIGHT, WIDTH = 720, 1280
 BUDGET = 4 * 10**9

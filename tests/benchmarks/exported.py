@@ -17,8 +17,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.timing import Row, print_table, row
+from trainer.benchmarking.memory import reset_peak, status
 
 METHODS = ("Layer", "SampleSplat", "PixelGather", "Optimized", "SBMC")
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}

@@ -13,8 +13,6 @@ loaded runtime, the weights and the input.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import statistics
 import subprocess
@@ -77,6 +75,7 @@ def child(runtime: str, folder: Path, calls: int) -> dict[str, Any]:
     import torch
 
     from models import WSKP
+    from trainer.benchmarking.memory import reset_peak, status
     from trainer.export import SUFFIXES, export, load_artifact
     from trainer.export.entry import example
     from trainer.export.parity import relative_error
@@ -102,23 +101,6 @@ def child(runtime: str, folder: Path, calls: int) -> dict[str, Any]:
         memory = status("VmHWM") - before
         error = relative_error(color, net.deploy()(buffers).color)
     return {"times": times, "memory": memory, "error": error}
-
-
-def reset_peak() -> int:
-    """Forget the peak of this process and return its present resident set in bytes.
-
-    Memory that was released before is given back first: what reuses it would not be seen.
-    """
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")
-    return status("VmRSS")
-
-
-def status(key: str) -> int:
-    """Return a size of /proc/self/status in bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith(f"{key}:")).split()[1]) * 1024
 
 
 if __name__ == "__main__":

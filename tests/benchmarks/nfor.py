@@ -28,10 +28,10 @@ from torch import Tensor
 from models import NFOR
 from models.ops import fused
 from tests.benchmarks import arithmetic
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.mosaic import mosaic
 from tests.benchmarks.timing import Row, print_table, row
 from tests.models.frames import largest_relative
+from trainer.benchmarking.memory import reset_peak, status
 
 SIZE, SMALL, THREADS = (720, 1280), (256, 256), 2
 FEATURES = ("normal", "albedo", "depth")

@@ -35,9 +35,9 @@ from torch.utils.flop_counter import FlopCounterMode
 import models
 from models.blocks.per_sample import PerSample
 from models.layers import SCALES, Layer, Optimized, PixelGather, SampleSplat
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.timing import Row, medians, print_table, row
 from tests.models.frames import random_samples
+from trainer.benchmarking.memory import reset_peak, status
 
 NETWORKS = ("PixelGather", "SampleSplat", "Layer", "Optimized")
 COUNTS = (2, 4, 8, 16, 32)

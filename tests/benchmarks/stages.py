@@ -27,9 +27,9 @@ from models import Optimized
 from models.blocks.per_sample import Frame, Seen
 from models.denoiser import Buffers
 from models.layers import Composite, Sorted
-from tests.benchmarks.inference import reset_peak, status
 from tests.benchmarks.timing import Row, print_table, row
 from tests.models.frames import random_samples
+from trainer.benchmarking.memory import reset_peak, status
 
 SIZE, SPP, THREADS = (1080, 1920), 8, 2
 AGAIN, MEASURE = "sample reducer, again", "largest depth of the frame"

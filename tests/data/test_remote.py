@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import multiprocessing
 import os
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from data import remote, remote_patience, remote_systems
-from data.remote_failures import ContentError, judge
+from data.remote_failures import ContentError, Judgement, judge
 from data.remote_systems import system_of
 from tests.data.remote_servers import Handler, S3Server, WebServer, free_ports
 
@@ -109,7 +110,7 @@ def test_what_was_sent_comes_back(scheme: str, web: WebServer, bucket: str, tmp_
     assert remote.exists(url)
     assert not remote.exists(folder)
     assert remote.size_of(url) == len(DATA)
-    assert remote.sha256_of(url) == remote.file_sha256(source)
+    assert remote.sha256_of(url, len(DATA)) == remote.file_sha256(source)
     pieces: list[int] = []
     remote.fetch(url, target, size=len(DATA), sha256=remote.file_sha256(source), report=pieces.append)
     assert target.read_bytes() == DATA
@@ -123,11 +124,40 @@ def test_what_was_sent_comes_back(scheme: str, web: WebServer, bucket: str, tmp_
     assert remote.listing(folder) == (None if scheme == "http" else {})
 
 
+def test_no_more_is_read_for_a_checksum_than_the_file_should_have(web: WebServer):
+    read = 0
+
+    def endless(handler: Handler, data: bytes) -> bool:
+        nonlocal read
+        handler.send_response(200)
+        handler.end_headers()
+        with contextlib.suppress(OSError):
+            while read < 1 << 30:
+                read += handler.wfile.write(bytes(1 << 16))
+        handler.close_connection = True
+        return True
+
+    web.fault = endless
+    assert remote.sha256_of(f"{web.url}/file", 1000) is None
+    assert read < 1 << 28
+
+
+def test_a_missing_bucket_is_no_missing_file(monkeypatch):
+    judged = Judgement("no bucket", "status 404")
+    monkeypatch.setattr(remote_patience, "judge", lambda error: judged)
+    monkeypatch.setattr(remote, "_size", lambda url: {}["x"])
+    with pytest.raises(remote_patience.NoBucketError, match="has no bucket 'b'"):
+        remote.exists("s3://b/x")
+    judged = Judgement("missing", "status 404")
+    assert not remote.exists("s3://b/x")
+
+
 def test_a_large_file_goes_to_s3_and_back_in_pieces(bucket: str, tmp_path: Path):
     source = tmp_path / "source"
     source.write_bytes(os.urandom(1 << 20) * 110)
     remote.send(source, f"{bucket}/large")
-    remote.fetch(f"{bucket}/large", tmp_path / "target", sha256=remote.sha256_of(f"{bucket}/large"))
+    sha256 = remote.sha256_of(f"{bucket}/large", source.stat().st_size)
+    remote.fetch(f"{bucket}/large", tmp_path / "target", sha256=sha256)
     assert remote.file_sha256(tmp_path / "target") == remote.file_sha256(source)
 
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ import torch
 from data import remote_patience
 from data.module import Shards
 from data.root import resolve_root
+from data.shards import cache as shard_cache
 from data.shards.cache import ShardCache
 from data.shards.index import INDEX, Index
 from data.shards.plan import shards_ahead
@@ -151,7 +153,39 @@ def test_a_shard_in_use_stays_and_others_leave_longest_unused_first(index, web, 
         assert mapped[:] == (index.root / shards[0].file).read_bytes(), "readable though removed by hand"
 
 
-def test_shards_of_another_set_make_room(index, web, cache, tmp_path):
+def test_a_cache_without_room_is_not_looked_at_again_for_a_while(index, web, cache, monkeypatch):
+    at_url = Index.read_remote(f"{web.url}/shards", cache)
+    small, *others = sorted(at_url.of("train"), key=lambda shard: shard.bytes)
+    copies, looks = ShardCache(at_url, small.bytes), []
+    look = copies._make_room
+    monkeypatch.setattr(copies, "_make_room", lambda *args: looks.append(args) or look(*args))
+    assert copies.add(small)
+    for _ in range(3):
+        assert not any(copies.add(shard) for shard in others)
+    assert len(looks) == 2
+    assert copies.add(others[0], wanted_now=True), "who needs it now gets it"
+    assert not copies.add(others[1])
+    assert len(looks) == 3
+    later = time.monotonic() + 1.1
+    monkeypatch.setattr(shard_cache, "time", SimpleNamespace(monotonic=lambda: later))
+    assert not copies.add(others[1])
+    assert len(looks) == 4
+
+
+def test_threads_that_download_ahead_end_with_their_loader(index, web, cache):
+    others = set(threading.enumerate())
+    data = Shards(f"{web.url}/shards", 4, 0, buffers=NAMES)
+    next(iter(data.train_dataloader()))
+    begun = {thread for thread in threading.enumerate() if thread.name.startswith("prefetch-")} - others
+    assert len(begun) == 2
+    data.teardown("fit")
+    for thread in begun:
+        thread.join(30)
+    assert not any(thread.is_alive() for thread in begun)
+
+
+def test_shards_of_another_set_make_room(index, web, cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(shard_cache, "LOOK_AGAIN_S", 0.0)
     cache.mkdir(parents=True)
     other = cache / f"{'0' * 64}.tar"
     other.write_bytes(bytes(index.of("train")[0].bytes))
@@ -164,7 +198,10 @@ def test_shards_of_another_set_make_room(index, web, cache, tmp_path):
     assert not other.exists()
 
 
-def test_what_a_killed_download_left_is_removed_and_one_that_goes_on_is_counted(index, web, cache):
+def test_what_a_killed_download_left_is_removed_and_one_that_goes_on_is_counted(
+    index, web, cache, monkeypatch
+):
+    monkeypatch.setattr(shard_cache, "LOOK_AGAIN_S", 0.0)
     at_url = Index.read_remote(f"{web.url}/shards", cache)
     one, two = at_url.of("train")[:2]
     copies = ShardCache(at_url, one.bytes + two.bytes)

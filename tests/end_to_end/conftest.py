@@ -57,5 +57,7 @@ def workplace(tmp_path, cache):
 def trained(tmp_path_factory, cache):
     """A workplace in which the smoke configuration was trained, with what the command printed."""
     place = Workplace(tmp_path_factory.mktemp("trained"), cache)
+    place.alive = tmp_path_factory.mktemp("health") / "alive"
+    place.environment["PENUMBRA_ALIVE"] = str(place.alive)
     place.printed = place.trainer("fit", "--config", "wskp_bmfr.yaml", "--config", "smoke.yaml")
     return place

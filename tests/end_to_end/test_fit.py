@@ -33,6 +33,10 @@ def test_one_finished_run_with_checkpoints_and_exports(trained):
     assert "Warning" not in trained.printed
 
 
+def test_training_tells_a_health_check_that_it_goes_on(trained):
+    assert trained.alive.is_file()
+
+
 def test_run_says_what_it_was(run):
     _, tracked = run
     assert tracked.info.status == "FINISHED"

@@ -1,5 +1,6 @@
 """Builds the manifests as `kubectl apply -k` does, and finds its way in them."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -44,8 +45,19 @@ def containers(template):
     return [*template["spec"].get("initContainers", []), *template["spec"]["containers"]]
 
 
+def number(quantity):
+    """Return a quantity such as `500m` or `4Gi` as a number."""
+    digits, unit = re.fullmatch(r"(\d+)([a-zA-Z]*)", str(quantity)).groups()
+    powers = {"": 1, "m": 1e-3, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
+    return int(digits) * powers[unit]
+
+
 def of_kind(documents, kind):
     return [document for document in documents if document["kind"] == kind]
+
+
+def plain_environment(container):
+    return {entry["name"]: entry["value"] for entry in container.get("env", []) if "value" in entry}
 
 
 def labels(template):

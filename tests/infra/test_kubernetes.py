@@ -14,7 +14,7 @@ from importlib import metadata
 import kubernetes_validate
 import pytest
 
-from tests.infra.manifests import FOLDERS, containers, every_folder, of_kind, templates
+from tests.infra.manifests import FOLDERS, containers, every_folder, number, of_kind, templates
 from tests.stack.compose import ROOT
 
 RAY = {"RayCluster", "RayJob"}
@@ -116,12 +116,6 @@ def test_containers_have_requests_within_limits_and_a_place_to_write(built, fold
             for quantity, asked in resources["requests"].items():
                 assert number(asked) <= number(resources["limits"][quantity]), (name, quantity)
             assert "/tmp" in {mount["mountPath"] for mount in container["volumeMounts"]}
-
-
-def number(quantity):
-    digits, unit = re.fullmatch(r"(\d+)([a-zA-Z]*)", str(quantity)).groups()
-    powers = {"": 1, "m": 1e-3, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
-    return int(digits) * powers[unit]
 
 
 @every_folder

@@ -1,19 +1,42 @@
 """The parts of the manifests fit each other, and the compose file where they overlap."""
 
+import argparse
+import inspect
 import re
-import subprocess
-import sys
 
 import pytest
 import yaml
 
-from tests.infra.manifests import containers, every_folder, labels, of_kind, selects, templates
+from data import Shards
+from tests.infra.manifests import (
+    containers,
+    every_folder,
+    labels,
+    number,
+    of_kind,
+    plain_environment,
+    selects,
+    templates,
+)  # fmt: skip
 from tests.stack.compose import ROOT, read_compose
+from trainer.commands import serve
+from trainer.commands.denoise import size_in_bytes
+from trainer.serving.memory import needed
 
 SERVICES = read_compose()["services"]
 COMPOSE = {"training": "trainer"}  # name there where it differs
 MADE_BY_USERS = {"penumbra", "tracking-certificate", "serve-certificate"}
 """Secrets that infra/README.md tells to make."""
+
+
+def serve_needs(words):
+    """Return the memory that `trainer serve` may take with these words, and its limits."""
+    assert words[:2] == ["trainer", "serve"]
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    args = parser.parse_args(words[2:])
+    limits = serve._limits(args)
+    return needed(limits, args.memory), limits
 
 
 @every_folder
@@ -101,10 +124,6 @@ def test_mounts_have_volumes_and_secret_files_are_mounted(built, folder):
                 assert needed == (given if "secrets" in mounted else set())
 
 
-def plain_environment(container):
-    return {entry["name"]: entry["value"] for entry in container.get("env", []) if "value" in entry}
-
-
 @pytest.mark.parametrize("folder", ["base/stack", "base/training", "base/serve"])
 def test_images_commands_and_environment_are_those_of_the_compose_file(built, folder):
     for name, template in templates(built[folder]):
@@ -112,10 +131,54 @@ def test_images_commands_and_environment_are_those_of_the_compose_file(built, fo
         container = template["spec"]["containers"][0]
         assert container["image"] == service["image"]
         expected = {key: str(value) for key, value in service.get("environment", {}).items()}
-        expected.pop("PENUMBRA_LAUNCH", None)  # torchrun's identity there
-        assert plain_environment(container) == expected
-        if name != "training":  # torchrun on several nodes there, one process here
+        given = plain_environment(container)
+        if name == "training":  # torchrun on several nodes, one process there
+            expected.pop("PENUMBRA_LAUNCH")
+            assert {"NODES", "PROCESSES"} <= given.keys()
+            own = {"PENUMBRA_CACHE": "/cache", "NODES": given["NODES"], "PROCESSES": given["PROCESSES"]}
+            assert given == expected | own
+        else:
+            assert given == expected
             assert container["args"] == [str(word) for word in service["command"]]
+
+
+@pytest.mark.parametrize("folder", ["base/training", "overlays/cluster-training", "base/ray"])
+def test_copies_of_shards_lie_on_the_node_itself(built, folder):
+    for name, template in templates(built[folder]):
+        if name == "training-on-ray":  # only hands the job in
+            continue
+        (container,) = template["spec"]["containers"]
+        place = plain_environment(container)["PENUMBRA_CACHE"]
+        mounts = {mount["mountPath"]: mount["name"] for mount in container["volumeMounts"]}
+        (volume,) = [v for v in template["spec"]["volumes"] if v["name"] == mounts[place]]
+        most = inspect.signature(Shards).parameters["cache_gb"].default * 1e9
+        assert number(volume["emptyDir"]["sizeLimit"]) > most
+        assert "medium" not in volume["emptyDir"]
+
+
+@pytest.mark.parametrize("folder", ["base/serve", "overlays/small", "overlays/cluster"])
+def test_what_requests_may_take_fits_the_memory_and_the_disk_of_the_service(built, folder):
+    (deployment,) = [d for d in of_kind(built[folder], "Deployment") if d["metadata"]["name"] == "serve"]
+    pod = deployment["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    memory, limits = serve_needs(container["args"])
+    assert memory <= number(container["resources"]["limits"]["memory"])
+    scratch = next(volume["emptyDir"] for volume in pod["volumes"] if volume["name"] == "scratch")
+    assert "medium" not in scratch
+    assert limits.disk < number(scratch["sizeLimit"])
+    waits = int(container["lifecycle"]["preStop"]["exec"]["command"][1])
+    assert waits >= 10
+    assert pod["terminationGracePeriodSeconds"] > waits + limits.compute + limits.send
+
+
+def test_what_requests_may_take_fits_the_memory_of_the_service_on_one_machine():
+    service = SERVICES["serve"]
+    memory, limits = serve_needs(service["command"])
+    allowed = size_in_bytes(service["deploy"]["resources"]["limits"]["memory"].replace("g", "GiB"))
+    (temporary,) = service["tmpfs"]  # in the same memory
+    assert memory + limits.disk <= allowed
+    assert limits.disk < size_in_bytes(temporary.partition("size=")[2].replace("g", "GiB"))
+    assert int(service["stop_grace_period"].rstrip("s")) > limits.compute + limits.send
 
 
 def test_ray_nodes_have_the_trainers_environment_with_secrets_as_variables(built):
@@ -166,39 +229,3 @@ def test_network_policies_let_through_what_is_used_and_nothing_else(built):
         pod = labels(pods[name])
         assert allows(policies, "Egress", pod, pod, (40000,))
         assert allows(policies, "Ingress", pod, pod, (40000,))
-
-
-@pytest.mark.parametrize("folder", ["base/training", "overlays/small-training", "overlays/cluster-training"])
-def test_nodes_of_a_training_meet_and_agree_on_their_number(built, folder):
-    (job,) = of_kind(built[folder], "Job")
-    (service,) = of_kind(built[folder], "Service")
-    spec, pod = job["spec"], job["spec"]["template"]["spec"]
-    arguments = dict(word.split("=", 1) for word in pod["containers"][0]["args"] if "=" in word)
-    assert spec["completionMode"] == "Indexed"
-    assert spec["completions"] == spec["parallelism"] == int(arguments["--nnodes"])
-    assert int(arguments["--trainer.num_nodes"]) == spec["completions"]
-    assert arguments["--trainer.devices"] == arguments["--nproc-per-node"]
-    assert arguments["--node-rank"] == "$(JOB_COMPLETION_INDEX)"
-    name, port = service["metadata"]["name"], service["spec"]["ports"][0]["port"]
-    assert arguments["--rdzv-endpoint"] == f"{job['metadata']['name']}-0.{name}:{port}"
-    assert pod["subdomain"] == name
-    assert service["spec"]["clusterIP"] == "None"
-    assert service["spec"]["publishNotReadyAddresses"] is True
-    assert pod["restartPolicy"] == "Never"  # a pod failure policy needs it
-    actions = {rule["action"] for rule in spec["podFailurePolicy"]["rules"]}
-    assert actions == {"FailJob", "Ignore"}
-    checked = {rule["onExitCodes"]["containerName"] for rule in spec["podFailurePolicy"]["rules"][:1]}
-    assert checked <= {container["name"] for container in pod["initContainers"]}
-    gpus = pod["containers"][0]["resources"]["limits"].get("nvidia.com/gpu")
-    assert gpus is None or gpus == arguments["--trainer.devices"]
-
-
-@pytest.mark.slow
-def test_wrong_configuration_ends_a_training_at_once(built):
-    (job,) = of_kind(built["base/training"], "Job")
-    words = job["spec"]["template"]["spec"]["initContainers"][0]["args"]
-    assert words[:2] == ["trainer", "fit"]
-    done = subprocess.run(
-        [sys.executable, "-m", *words[:2], "--config=no_such.yaml", *words[3:]], cwd=ROOT, capture_output=True
-    )
-    assert done.returncode == 2

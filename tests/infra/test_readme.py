@@ -1,6 +1,7 @@
 """What infra/README.md tells to do exists: images, services, manifests, options, pictures."""
 
 import re
+import shutil
 import subprocess
 import sys
 
@@ -42,9 +43,20 @@ def test_paths_exist():
     for path in re.findall(r"`(overlays/[\w-]+)`", TEXT):
         assert (ROOT / "infra" / "kubernetes" / path / "kustomization.yaml").is_file()
     for path in re.findall(r"infra/(?:kubernetes|slurm|compose)/[\w./-]*\w", CODE):
-        assert (ROOT / path).exists() or path.endswith("secrets/tracking_password"), path
+        assert (ROOT / path).exists() or path.startswith("infra/compose/secrets"), path
     volume = re.findall(r"-v (penumbra_\w+):", CODE)
     assert {name.removeprefix("penumbra_") for name in volume} <= set(read_compose()["volumes"])
+
+
+def test_secrets_of_a_cluster_are_made_where_the_next_command_reads_them_and_git_ignores_them(tmp_path):
+    shutil.copytree(ROOT / "infra" / "compose", tmp_path / "infra" / "compose")
+    (made,) = re.findall(r"^(infra/compose/make-secrets[^#\n]*)", CODE, re.MULTILINE)
+    (read,) = re.findall(r"^kubectl create secret generic .* --from-file (\S+)", CODE, re.MULTILINE)
+    subprocess.run(made.split(), cwd=tmp_path, check=True, capture_output=True)
+    names = {path.name for path in (tmp_path / read).iterdir()}
+    assert names == set(read_compose()["secrets"])
+    done = subprocess.run(["git", "check-ignore", "--quiet", f"{read}/x"], cwd=ROOT)
+    assert done.returncode == 0
 
 
 def test_pictures_are_there_and_small():

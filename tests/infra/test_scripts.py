@@ -1,6 +1,7 @@
 """The shell scripts of images and of the compose folder, run for real."""
 
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stack.compose import FOLDER, ROOT, read_compose
+from tests.stack.compose import FOLDER, ROOT, image_of, read_compose
 
 SCRIPTS = [
     ROOT / "docker" / "with-secrets",
@@ -89,24 +90,43 @@ def test_secrets_are_random_made_once_and_those_of_the_compose_file(tmp_path):
     assert second == first
 
 
-def test_job_is_healthy_while_it_is_young_or_writes(tmp_path):
-    def healthy(age_s):
-        started = (float(Path("/proc/uptime").read_text().split()[0]) - age_s) * os.sysconf("SC_CLK_TCK")
-        stat = tmp_path / "stat"
-        stat.write_text("1 (a (b) c) S " + " ".join(["0"] * 18 + [f"{started:.0f}", "0"]))
-        return run("with-progress-of", str(folder), JOB_STAT=str(stat))
-
-    folder = tmp_path / "work"
-    folder.mkdir()
-    assert healthy(60).returncode == 0
-    assert healthy(3600).returncode == 1
-    assert "changed for 30 minutes" in healthy(3600).stderr
-    (folder / "metrics").touch()
-    assert healthy(3600).returncode == 0
-    an_hour_ago = time.time() - 3600
-    os.utime(folder / "metrics", (an_hour_ago, an_hour_ago))
-    assert healthy(3600).returncode == 1
+def health(tmp_path, age_s, **variables):
+    """Run the health check of a job that is so old."""
+    started = (float(Path("/proc/uptime").read_text().split()[0]) - age_s) * os.sysconf("SC_CLK_TCK")
+    stat = tmp_path / "stat"
+    stat.write_text("1 (a (b) c) S " + " ".join(["0"] * 18 + [f"{started:.0f}", "0"]))
+    return run("with-progress-of", str(tmp_path / "alive"), JOB_STAT=str(stat), **variables)
 
 
-def test_health_of_no_folder_is_an_error(tmp_path):
-    assert "is no folder" in run("with-progress-of", str(tmp_path / "absent")).stderr
+def test_job_is_healthy_while_it_is_young_or_works(tmp_path):
+    assert health(tmp_path, 60).returncode == 0
+    assert health(tmp_path, 3600).returncode == 1
+    assert "no batch, sample or frame for 30 minutes" in health(tmp_path, 3600).stderr
+    (tmp_path / "alive").touch()
+    assert health(tmp_path, 3600).returncode == 0
+    age_minutes(tmp_path / "alive", 60)
+    assert health(tmp_path, 3600).returncode == 1
+    assert health(tmp_path, 3600, STALL_MINUTES="90").returncode == 0
+
+
+def test_files_of_others_do_not_make_a_job_that_hangs_healthy(tmp_path):
+    (tmp_path / "alive").touch()
+    age_minutes(tmp_path / "alive", 60)
+    (tmp_path / "metrics of another run").touch()
+    assert health(tmp_path, 3600).returncode == 1
+
+
+def age_minutes(path, minutes):
+    then = time.time() - 60 * minutes
+    os.utime(path, (then, then))
+
+
+def test_health_of_no_file_is_an_error():
+    assert "no file is given" in run("with-progress-of").stderr
+
+
+def test_what_touches_the_file_and_what_looks_at_it_agree():
+    for name in ("trainer", "render"):
+        service = read_compose()["services"][name]
+        (place,) = re.findall(r"PENUMBRA_ALIVE=(\S+)", image_of(service["image"]).last("ENV") or "") or [""]
+        assert service["healthcheck"]["test"] == ["CMD", "with-progress-of", place]

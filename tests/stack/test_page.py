@@ -10,15 +10,19 @@ from pathlib import Path
 
 import pytest
 
+from data import remote
 from data.exr import read_frame
+from data.frames import FrameSet
 from data.sample import SAMPLES
+from data.shards.index import Index
 from tests.end_to_end.conftest import Workplace, cache  # noqa: F401  # a fixture
 from tests.stack.compose import ROOT
 from tests.stack.processes import free_ports
 from trainer.tracking import open_client
 
 PAGE = "## From a laptop to a cluster\n"
-SMOKE = " --config smoke.yaml --trainer.accelerator cpu --data.init_args.train_patches 80"
+SMOKE = " --config smoke.yaml --data.init_args.train_patches 80"
+CPU = " --trainer.accelerator cpu"  # Ray decides by itself
 
 
 def commands():
@@ -31,7 +35,12 @@ def commands():
 TRAINING = [
     c for c in commands() if " fit " in c or c.startswith(("trainer submit --config", "trainer tune"))
 ]
-OTHERS = [c for c in commands() if c not in TRAINING and not c.startswith(("trainer serve", "curl"))]
+
+
+def only(beginning):
+    """Return the one command that begins so."""
+    (command,) = [command for command in commands() if command.startswith(beginning)]
+    return command
 
 
 @pytest.fixture(scope="module")
@@ -53,47 +62,104 @@ def shell(place, command):
     return done.stdout + done.stderr
 
 
+@pytest.fixture(scope="module")
+def client(stack):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in stack.environment.items():
+            patch.setenv(name, value)
+        yield open_client(stack.tracking_uri)
+
+
+def runs_of(client):
+    """Return the runs of all experiments by their number."""
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    return {run.info.run_id: run for run in client.search_runs(experiments, max_results=1000)}
+
+
 def test_page_has_every_kind_of_command():
-    words = {" ".join(command.split()[:2]) for command in commands()}
-    assert words >= {"trainer fit", "trainer submit", "trainer tune", "trainer prepare", "trainer inspect",
-                     "trainer sync", "trainer serve"}  # fmt: skip
+    others = ("trainer submit prepare", "trainer submit render", "trainer prepare", "trainer inspect",
+              "trainer sync", "trainer serve", "curl")  # fmt: skip
     assert len(TRAINING) == 5
-    assert len(commands()) == len(TRAINING) + len(OTHERS) + 2
+    assert sorted(commands()) == sorted([*TRAINING, *map(only, others)])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", OTHERS)
-def test_command_of_the_page_does_what_it_says(command, place):
-    printed = shell(place, command)
-    if "submit prepare" in command:
-        assert (place.folder / "shards" / "index.json").is_file()
-    if "render" in command:
-        assert (place.folder / "stills" / "manifest.json").is_file()
-    assert printed.strip()
+def test_a_cluster_prepares_the_shards_that_one_process_does(place):
+    shell(place, only("trainer submit prepare"))
+    shell(place, "trainer prepare frames --output alone")
+    made, alone = (Index.read(place.folder / name) for name in ("shards", "alone"))
+    assert [shard.sha256 for shard in made.shards] == [shard.sha256 for shard in alone.shards]
+    assert made.count("train") > 0
+
+
+@pytest.mark.slow
+def test_a_cluster_renders_every_frame(place):
+    shell(place, only("trainer submit render"))
+    frames = FrameSet(place.folder / "stills")
+    assert len(frames.scenes()) == 2
+    for scene in frames.scenes():
+        for record in frames.frames(scene):
+            assert frames.read(scene, record.index).buffers["color"].shape == (32, 32, 3)
+        assert frames.frames(scene)
+
+
+@pytest.mark.slow
+def test_shards_in_a_store_are_complete_and_told(place, client):
+    shell(place, only("trainer prepare"))
+    shell(place, "trainer prepare frames --output alone --force")
+    alone = Index.read(place.folder / "alone")
+    found = remote.listing("s3://penumbra/shards")
+    assert found is not None
+    assert found.items() >= {shard.file: shard.bytes for shard in alone.shards}.items()
+    for shard in alone.shards:
+        assert remote.sha256_of(f"s3://penumbra/shards/{shard.file}", shard.bytes) == shard.sha256
+    printed = shell(place, only("trainer inspect"))
+    for split in ("train", "validation"):
+        assert f"{split}: {alone.count(split)} samples in {len(alone.of(split))} shards" in printed
+
+
+@pytest.mark.slow
+def test_what_a_server_missed_is_sent_later(place, client, stack):
+    before = runs_of(client)
+    stack.tracking.stop()
+    shell(place, TRAINING[0] + SMOKE + CPU)
+    stack.tracking.start()
+    assert runs_of(client).keys() == before.keys()
+    shell(place, only("trainer sync"))
+    (new,) = runs_of(client).keys() - before.keys()
+    run = client.get_run(new)
+    assert run.info.status == "FINISHED"
+    assert sorted(entry.step for entry in client.get_metric_history(new, "train/loss_step")) == [0, 1, 2, 3]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", TRAINING)
-def test_training_of_the_page_ends_with_a_finished_run(command, place, stack, monkeypatch):
-    for name, value in stack.environment.items():
-        monkeypatch.setenv(name, value)
-    client = open_client(stack.tracking_uri)
+def test_training_of_the_page_ends_with_finished_runs_of_its_own(command, place, client):
+    before = runs_of(client)
     if "s3://" in command:
         shell(place, "trainer prepare frames --output s3://penumbra/shards --force")
-    shell(place, command + SMOKE)
-    experiments = [e.experiment_id for e in client.search_experiments()]
-    newest = client.search_runs(experiments, order_by=["attributes.start_time DESC"], max_results=1)[0]
-    assert newest.info.status == "FINISHED"
+    shell(place, command + SMOKE + (CPU if " fit " in command else ""))
+    new = {number: run for number, run in runs_of(client).items() if number not in before}
+    assert {run.info.status for run in new.values()} == {"FINISHED"}
+    parents = [run.data.tags.get("mlflow.parentRunId") for run in new.values()]
+    if "tune" in command:
+        (sweep,) = [number for number, parent in zip(new, parents, strict=True) if parent is None]
+        assert parents.count(sweep) == 2 == len(new) - 1
+        return
+    (run,) = new.values()
+    assert run.data.metrics["val/psnr_wskp"] > 0
+    if "s3://" in command:
+        assert "s3://penumbra/shards" in run.data.params.values()
+    if "torchrun" in command:
+        assert run.data.params["trainer.devices"] == "2"
 
 
 @pytest.mark.slow
-def test_model_of_the_page_is_served(place, stack, monkeypatch):
-    for name, value in stack.environment.items():
-        monkeypatch.setenv(name, value)
-    if not open_client(stack.tracking_uri).search_model_versions("name='wskp'"):
-        shell(place, TRAINING[0] + SMOKE)
-    open_client(stack.tracking_uri).set_registered_model_alias("wskp", "champion", "1")
-    serve, curl = commands()[-2:]
+def test_model_of_the_page_is_served(place, client):
+    if not client.search_model_versions("name='wskp'"):
+        shell(place, TRAINING[0] + SMOKE + CPU)
+    client.set_registered_model_alias("wskp", "champion", "1")
+    serve, curl = only("trainer serve"), only("curl")
     (port,) = free_ports(1)
     server = place.start(*serve.split()[1:], "--port", str(port))
     try:
@@ -102,7 +168,10 @@ def test_model_of_the_page_is_served(place, stack, monkeypatch):
     finally:
         server.terminate()
         server.communicate(timeout=60)
-    assert read_frame(place.folder / "denoised.exr").height == 180
+    noisy = read_frame(place.folder / "frames" / "classroom" / "f000.exr").buffers["color"]
+    denoised = read_frame(place.folder / "denoised.exr").buffers["color"]
+    assert denoised.shape == noisy.shape
+    assert denoised.std() < noisy.std()
 
 
 def wait_until_healthy(port, server):

@@ -8,6 +8,7 @@ import urllib.request
 from base64 import b64encode
 from pathlib import Path
 
+import psutil
 import pytest
 import s3fs
 
@@ -15,7 +16,9 @@ from data.exr import read_frame
 from data.sample import SAMPLES
 from tests.end_to_end.conftest import Workplace, cache  # noqa: F401  # a fixture
 from tests.end_to_end.test_resume import wait_for_step
+from tests.stack.compose import ROOT
 from trainer.runs import RunRecord
+from trainer.serving.memory import PROCESS
 from trainer.tracking import open_client
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -46,7 +49,7 @@ SEARCH = "/api/2.0/mlflow/experiments/search?max_results=5"
 def place(stack, tmp_path_factory, cache):  # noqa: F811
     """An empty folder whose commands use the servers, with the environment of the service `trainer`."""
     place = Workplace(tmp_path_factory.mktemp("place"), cache)
-    place.environment |= stack.environment
+    place.environment |= stack.environment | {"PENUMBRA_ALIVE": str(place.folder / "alive")}
     return place
 
 
@@ -135,9 +138,20 @@ def test_killed_run_continues_in_its_mlflow_run_without_gap_or_duplicate(run, cl
     experiment = client.get_experiment_by_name("wskp_bmfr")
     assert [found.info.run_id for found in client.search_runs([experiment.experiment_id])] == [run.run_id]
     assert client.get_run(run.run_id).info.status == "FINISHED"
-    (loss,) = [name for name in client.get_run(run.run_id).data.metrics if name.startswith("train/loss")][:1]
-    steps = [entry.step for entry in client.get_metric_history(run.run_id, loss)]
-    assert steps == sorted(set(steps))
+    for name, expected in (("train/loss_step", range(21)), ("val/psnr_wskp", (6, 13, 20))):
+        steps = sorted(entry.step for entry in client.get_metric_history(run.run_id, name))
+        assert steps == list(expected), name
+
+
+def test_health_check_of_the_trainer_sees_that_it_worked(run, place, stack):
+    place_of_image = Path(stack.services["trainer"].health[1])
+    assert place_of_image.name == "alive"
+    (place.folder / "stat").write_text("1 (a) S " + "0 " * 20)  # as old as this machine
+    done = subprocess.run(
+        [ROOT / "docker" / "with-progress-of", place.folder / "alive"],
+        env=place.environment | {"JOB_STAT": str(place.folder / "stat"), "STALL_MINUTES": "60"},
+    )
+    assert done.returncode == 0
 
 
 def test_artifacts_lie_in_the_store_and_pass_through_the_server(run, client, stack, place):
@@ -177,6 +191,7 @@ def test_serve_runs_the_command_of_the_compose_file(champion, stack):
     address = f"http://127.0.0.1:{stack.ports['serve']}/denoise"
     server.start()
     try:
+        assert psutil.Process(server.pid).memory_info().rss < PROCESS
         request = urllib.request.Request(
             address, data=FRAME.read_bytes(), headers={"Content-Type": "image/x-exr"}
         )

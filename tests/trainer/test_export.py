@@ -19,6 +19,7 @@ from models.denoiser import Buffers, Denoised, Denoiser
 from tests.conformance.test_denoisers import make
 from trainer.commands import export as command
 from trainer.export import SUFFIXES, Source, export, load_artifact
+from trainer.export.artifact import _OnnxRuntime
 from trainer.export.description import KEY, Description
 from trainer.export.entry import Sampled, example
 from trainer.export.onnx import OPSET
@@ -318,3 +319,15 @@ def test_a_file_less_exact_than_eager_or_of_no_use_is_refused(
     with pytest.raises(ValueError, match="the exported file differs by"):
         export(Rounded(eager, traced), tmp_path / "net.ts", "torchscript")
     assert not (tmp_path / "net.ts").exists()
+
+
+def test_a_failure_of_onnx_runtime_is_told_in_one_line():
+    shape = onnx.numpy_helper.from_array(np.array([7, 2]), "shape")
+    node = onnx.helper.make_node("Reshape", ["color", "shape"], ["out"])
+    sides = [onnx.helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, None) for n in ("color", "out")]
+    graph = onnx.helper.make_graph([node], "graph", sides[:1], sides[1:], [shape])
+    opset = [onnx.helper.make_opsetid("", 18)]
+    model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=9)
+    runtime = _OnnxRuntime(model.SerializeToString(), "cpu")
+    with pytest.raises(OSError, match=r"ONNX Runtime cannot run the model .*Reshape"):
+        runtime({"color": torch.zeros(1, 3, 4, 4)})

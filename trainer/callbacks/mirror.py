@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from pathlib import Path
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -37,13 +38,14 @@ class MirrorRun(Callback):
         self._ending, self._over = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._logger: MLflowTracking | None = None
+        self._folder = Path()
         self._trouble = ""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Begin to watch the run's folder, on the first rank."""
         logger = trainer.logger
         if stage == "fit" and trainer.is_global_zero and isinstance(logger, MLflowTracking):
-            self._logger = logger
+            self._logger, self._folder = logger, logger.folder
             logger.deliver_up_to(0)
             self._ending.clear()
             self._over.clear()
@@ -70,10 +72,9 @@ class MirrorRun(Callback):
         self._thread.join()
         self._thread = None
         if self._trouble:
-            assert self._logger is not None
             print(
                 f"warning: the end of the run is not in {self.storage}: {self._trouble}. It is whole in "
-                f"{self._logger.folder}, and only there; copy it before this machine goes away.",
+                f"{self._folder}, and only there; copy it before this machine goes away.",
                 file=sys.stderr,
                 flush=True,
             )
@@ -97,7 +98,7 @@ class MirrorRun(Callback):
         """Send what has changed; returns whether that worked, and says once where it does not."""
         assert self._logger is not None
         try:
-            send_run(self._logger.folder, self.storage, self._sent, journals)
+            send_run(self._folder, self.storage, self._sent, journals)
         except (OSError, ValueError) as error:
             if not self._trouble:
                 print(

@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any
 
+from trainer.cluster.engine import Cluster, connected
+
 POLL_S = 0.25
 """Seconds between two looks at the board."""
 
 PATIENCE_S = 45.0
 """Seconds that a cancelled job gets to end by itself."""
+
+DIED = ("RayActorError", "ActorDiedError", "ActorUnavailableError", "WorkerCrashedError",
+        "WorkerHealthCheckFailedError")  # fmt: skip
+"""Exceptions of Ray that tell of a process that is no more."""
+
+RAISED = re.compile(r"[\w.]*(Error|Exception|Interrupt|Exit)\b")
+"""How the line of a traceback begins that says what was raised."""
 
 
 class Board:
@@ -121,10 +131,47 @@ def follow(ray: Any, board: Any, job: Any) -> tuple[int, str]:
             if outcome is not None:
                 return outcome
     except ray.exceptions.RayError as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        return 1, f"the process that conducts the job was lost: {lines[0][:300]}"
+        return 1, f"the process that conducts the job failed: {reason(error)}"
     except KeyboardInterrupt:
         print("cancelling the job (again Ctrl-C: at once)", file=sys.stderr, flush=True)
         ray.get(board.cancel.remote())
         wait(PATIENCE_S)
         raise
+
+
+def conduct(cluster: Cluster, conductor: type, *arguments: Any) -> int:
+    """Run a job in a cluster and print what it prints; returns its exit code.
+
+    Args:
+        cluster: Where.
+        conductor: Class whose method `run` does the job, in the cluster; gets the board behind the arguments.
+        *arguments: Of the method.
+
+    Raises:
+        ValueError: Ray is missing, or the cluster has another release, or too little for the job.
+        OSError: The cluster cannot be reached.
+        KeyboardInterrupt: Ctrl-C, after the job was cancelled.
+    """
+    with connected(cluster) as ray:
+        board = ray.remote(num_cpus=0)(Board).remote()
+        head = ray.remote(num_cpus=0)(conductor).remote()
+        try:
+            code, message = follow(ray, board, head.run.remote(*arguments, board))
+        finally:
+            ray.kill(head)  # whose workers end with it
+    if message:
+        print(f"error: {message}", file=sys.stderr)
+    return code
+
+
+def reason(error: object) -> str:
+    """Return in one line why something failed in the cluster.
+
+    Args:
+        error: An exception of Ray, whose text may be a whole traceback, or such a text.
+    """
+    if type(error).__name__ in DIED:
+        return "its process died (killed, out of memory, or its node went away)"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    words = next((line for line in reversed(lines) if RAISED.match(line)), "")
+    return (words or (lines[0] if lines else type(error).__name__))[:300]

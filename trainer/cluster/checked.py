@@ -37,12 +37,14 @@ class Training:
         files: Their contents.
         root: Folder of all runs.
         experiment: Name of the experiment.
+        tracking_uri: Configured tracking store, None for that of the environment or the local one.
     """
 
     arguments: tuple[str, ...]
     files: tuple[str, ...]
     root: str
     experiment: str
+    tracking_uri: str | None = None
 
     def restored(self, folder: Path) -> list[str]:
         """Write the configurations into a folder, and return the command line that names them."""
@@ -108,6 +110,7 @@ def check_training(arguments: Sequence[str]) -> Training:
         tuple(texts),
         str(logger.init_args.root) if tracked else "runs",
         str(logger.init_args.experiment) if tracked else "penumbra",
+        logger.init_args.tracking_uri if tracked else None,
     )
 
 

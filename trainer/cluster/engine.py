@@ -49,13 +49,17 @@ class Cluster:
 
     Attributes:
         address: Address of a running Ray (`ray://…`, `auto`, `host:port`); None: one is started here.
-        cpus: Processor cores that the job needs in all, for a Ray that is started here.
-        gpus: The same for GPUs.
+        workers: Processes of the job at one time.
+        cpus: Processor cores of each.
+        gpus: GPUs of each.
+        together: Whether all must run at one time; otherwise they wait for each other.
     """
 
     address: str | None = None
+    workers: int = 1
     cpus: int = 1
     gpus: float = 0
+    together: bool = True
 
 
 def need_ray() -> None:
@@ -76,7 +80,8 @@ def connected(cluster: Cluster) -> Iterator[Any]:
     """Yield the module `ray`, connected; what was started here is ended.
 
     Raises:
-        ValueError: Ray is missing, or the nodes have another release of Penumbra or none.
+        ValueError: Ray is missing, or the nodes have another release of Penumbra or none, or this machine
+            has too few GPUs.
         OSError: Nothing answers at the address.
     """
     need_ray()
@@ -91,6 +96,7 @@ def connected(cluster: Cluster) -> Iterator[Any]:
     begin = _start if cluster.address is None else _reach
     begin(ray, cluster)
     try:
+        _check_room(ray, cluster)
         _check_release(ray)
         yield ray
     finally:
@@ -101,7 +107,7 @@ def _start(ray: Any, cluster: Cluster) -> None:
     os.environ.pop("RAY_ADDRESS", None)  # it would win over "local"
     # On one machine Ray would end processes of the job because others' have filled the memory.
     os.environ.setdefault("RAY_memory_monitor_refresh_ms", "0")
-    cores = max(len(os.sched_getaffinity(0)), cluster.cpus)
+    cores = max(len(os.sched_getaffinity(0)), cluster.workers * cluster.cpus)  # they may share
     print(f"starting Ray on this machine ({cores} CPUs)", file=sys.stderr, flush=True)
     try:
         ray.init(
@@ -129,7 +135,7 @@ def _check_address(address: str) -> None:
     if address == "auto":
         return
     if not colon or not port.isdigit() or not 0 < int(port) < 65536 or "/" in host:
-        raise UsageError(f"--address {address}: expected ray://HOST:10001, HOST:6379 or auto")
+        raise UsageError(f"--address {address}: expected ray://HOST:10001, or on a node HOST:6379 or auto")
     try:
         with socket.create_connection((host, int(port)), timeout=CONNECT_S) as found:
             loopback = found.getpeername()[0].startswith("127.")
@@ -162,16 +168,31 @@ def _reach(ray: Any, cluster: Cluster) -> None:
         ray.init(address=address, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0][:200]
-        raise OSError(f"--address {address}: no Ray cluster can be used there: {reason}") from None
-    have = ray.cluster_resources()
-    for kind, wanted in (("CPU", cluster.cpus), ("GPU", cluster.gpus)):
-        if have.get(kind, 0) < wanted:
-            print(
-                f"note: the job needs {wanted:g} {kind}s and the cluster has {have.get(kind, 0):g}; it waits "
-                "until nodes join (Ctrl-C gives up)",
-                file=sys.stderr,
-                flush=True,
-            )
+        outside = "" if address.startswith("ray://") else "; from another machine use ray://HOST:10001"
+        raise OSError(f"--address {address}: no Ray cluster can be used there: {reason}{outside}") from None
+
+
+def _check_room(ray: Any, cluster: Cluster) -> None:
+    """Find out whether a job fits into a cluster; others may join one that was not started here, or grow it.
+
+    Raises:
+        ValueError: It never will.
+    """
+    nodes = [node.get("Resources", {}) for node in ray.nodes() if node.get("Alive")]
+    count = cluster.workers if cluster.together else 1
+    for kind, each in (("CPU", cluster.cpus), ("GPU", cluster.gpus)):
+        have = [node.get(kind, 0) for node in nodes]
+        if sum(have) >= each * count and max(have, default=0) >= each:
+            continue
+        needs = f"the job needs {count} × {each:g} {kind}s"
+        if cluster.address is None:
+            raise ValueError(f"{needs}, and this machine has {sum(have):g}; ask for less or give --address")
+        print(
+            f"note: {needs}, and the cluster has {sum(have):g}, at most {max(have, default=0):g} on a node; "
+            "it waits until nodes join or an autoscaler starts some (Ctrl-C gives up)",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def release() -> str:

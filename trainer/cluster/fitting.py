@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trainer.cluster.board import Board, follow, sending
+from trainer.cluster.board import conduct, reason, sending
 from trainer.cluster.checked import Training
-from trainer.cluster.engine import Cluster, connected, enter, forwarded
+from trainer.cluster.engine import Cluster, enter, forwarded
 
 PERMANENT = (ValueError, FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
 """What another attempt would meet again: a wrong configuration, a missing file."""
@@ -77,22 +77,13 @@ def submit_training(
     """
     launch = f"submit {uuid.uuid4().hex[:12]}"
     job = Job(training, group, str(folder), forwarded(address), storage, launch)
-    with connected(Cluster(address, group.workers * group.cpus, group.workers * group.gpus)) as ray:
-        board = ray.remote(num_cpus=0)(Board).remote()
-        head = ray.remote(num_cpus=0)(_Head).remote()
-        try:
-            code, message = follow(ray, board, head.train.remote(job, board))
-        finally:
-            ray.kill(head)  # whose workers end with it
-    if message:
-        print(f"error: {message}", file=sys.stderr)
-    return code
+    return conduct(Cluster(address, group.workers, group.cpus, group.gpus), _Head, job)
 
 
 class _Head:
     """Conducts a Ray Train job from within the cluster, so that every kind of address works."""
 
-    def train(self, job: Job, board: Any) -> None:
+    def run(self, job: Job, board: Any) -> None:
         """Run the ranks, and restart them where one is lost."""
         enter(tempfile.mkdtemp(prefix="penumbra-head-"), job.environment)
         workers = f"{job.group.workers} worker" + ("s" if job.group.workers > 1 else "")
@@ -139,7 +130,7 @@ def _telling(board: Any, max_failures: int) -> Any:
 
         def after_exception(self, run_context: Any, worker_exceptions: dict[int, Exception]) -> None:
             self.failures += 1
-            what = "; ".join(f"rank {r}: {_reason(e)}" for r, e in sorted(worker_exceptions.items()))
+            what = "; ".join(f"rank {r}: {reason(e)}" for r, e in sorted(worker_exceptions.items()))
             then = f"attempt {self.failures + 1} of {max_failures + 1} follows"
             if self.failures > max_failures:
                 then = "no attempt is left"
@@ -150,21 +141,7 @@ def _telling(board: Any, max_failures: int) -> Any:
 
 def _reasons(error: Any) -> str:
     failures = getattr(error, "worker_failures", None) or {}
-    return "; ".join(f"rank {r}: {_reason(e)}" for r, e in sorted(failures.items())) or _reason(error)
-
-
-def _reason(error: BaseException) -> str:
-    """Return a failure in one line."""
-    if type(error).__name__ in (
-        "RayActorError",
-        "ActorDiedError",
-        "ActorUnavailableError",
-        "WorkerHealthCheckFailedError",
-    ):
-        return "its process died (killed, out of memory, or its node went away)"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    words = next((line for line in reversed(lines) if "Error" in line or "Exception" in line), "")
-    return (words or (lines[0] if lines else type(error).__name__))[:300]
+    return "; ".join(f"rank {r}: {reason(e)}" for r, e in sorted(failures.items())) or reason(error)
 
 
 def run_rank(config: dict[str, Any]) -> None:
@@ -174,22 +151,22 @@ def run_rank(config: dict[str, Any]) -> None:
     import ray
 
     rank = int(os.environ["RANK"])
-    enter(job.folder, {**job.environment, "PENUMBRA_LAUNCH": job.launch})
+    enter(job.folder, {**job.environment, "PENUMBRA_TRAINING": job.launch})
     try:
         if rank == 0:
             with sending(board):
                 _train(job, board)
         else:
             _train(job, board)
-    except (Exception, SystemExit) as error:
-        message = _permanent(error)
-        if message is None:
+    except BaseException as error:
+        if ray.get(board.cancelled.remote()):
+            if rank == 0:  # the others only lost it
+                ray.get(board.end.remote(130))
+        elif (message := _permanent(error)) is not None:
+            ray.get(board.end.remote(1, message if rank == 0 else f"rank {rank}: {message}"))
+        else:
             raise
-        ray.get(board.end.remote(1, message if rank == 0 else f"rank {rank}: {message}"))
         threading.Event().wait()  # for the end of the group, which would otherwise be started again
-    except KeyboardInterrupt:
-        ray.get(board.end.remote(130))
-        threading.Event().wait()
     else:
         if rank == 0:
             ray.get(board.end.remote(0))

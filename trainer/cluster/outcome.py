@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from trainer.outputs import replacing, write_whole
 
 FINISHED, STOPPED, FAILED, RUNNING = "finished", "stopped", "failed", "interrupted"
 
@@ -75,7 +76,7 @@ def table(trials: Sequence[Trial], metric: str) -> str:
         [
             "*" if trial.best else "",
             trial.name,
-            *(_number(trial.values.get(key, "")) for key in keys),
+            *(brief(trial.values.get(key, "")) for key in keys),
             "" if math.isnan(trial.score) else f"{trial.score:.4g}",
             "" if math.isnan(trial.cost) else f"{trial.cost:.0f}",
             str(trial.epoch),
@@ -105,7 +106,8 @@ def _short(key: str, keys: Sequence[str]) -> str:
     return key
 
 
-def _number(value: Any) -> str:
+def brief(value: Any) -> str:
+    """Return a value of a configuration for a table."""
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
@@ -120,15 +122,16 @@ def write_results(folder: Path, trials: Sequence[Trial], metric: str, mode: str)
     """
     found = {"metric": metric, "mode": mode, "trials": [asdict(trial) for trial in trials]}
     written = [folder / "trials.json", folder / "trials.txt"]
-    written[0].write_text(json.dumps(found, indent=1) + "\n")
-    written[1].write_text(table(trials, metric) + "\n")
+    write_whole(written[0], json.dumps(found, indent=1) + "\n")
+    write_whole(written[1], table(trials, metric) + "\n")
     if any(not math.isnan(trial.score) for trial in trials):
         written.append(folder / "pareto.png")
-        draw(written[-1], trials, metric)
+        with replacing(written[-1]) as partial:
+            draw(partial, trials, metric)
     best = next((trial for trial in trials if trial.best), None)
     if best is not None and (Path(best.run) / "config.yaml").is_file():
         written.append(folder / "best.yaml")
-        shutil.copyfile(Path(best.run) / "config.yaml", written[-1])
+        write_whole(written[-1], (Path(best.run) / "config.yaml").read_text())
     return written
 
 

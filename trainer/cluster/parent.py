@@ -4,89 +4,83 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from trainer.cluster.outcome import STOPPED, Trial
+from trainer.cluster.outcome import FINISHED, RUNNING, STOPPED, Trial
+from trainer.cluster.trials import launch_of
+from trainer.runs import RUN_FILE, Launch, RunRecord, end_launch, run_of_launch
+from trainer.spool.store import described, tracking_uri
+from trainer.tracking import MLflowTracking
 
 if TYPE_CHECKING:
     from trainer.cluster.sweep import Search
 
-RUN_FILE = "mlflow.txt"
+WAIT_S = 30.0
+"""Seconds that a search waits for the tracking store before its first trial."""
 
 
-@dataclass
 class ParentRun:
-    """The run; without a tracking store it is none, and the trials stand alone.
+    """The run, recorded in the search's folder as every run is: what a store lacks is sent by `trainer sync`.
 
-    Attributes:
-        run_id: Identifier, empty for none.
-        client: MLflow's client.
+    Args:
         search: What is searched.
+        results: Folder of the search; that of one that is resumed has a run already.
     """
 
-    run_id: str
-    client: Any
-    search: Search
+    def __init__(self, search: Search, results: Path) -> None:
+        self._search, self._results = search, results
+        training = search.training
+        if not (results / RUN_FILE).exists():
+            uri = tracking_uri(training.tracking_uri, Path(training.root))
+            RunRecord(training.experiment, f"search {results.name}", uri).save(results)
+        self._logger = self._opened(results)
+        self._logger.set_tags({"tune.search": results.name})
+        space = {key: f"{entry.kind} {list(entry.values)}"[:500] for key, entry in search.space.items()}
+        keys = ("trials", "epochs", "metric", "mode", "reduction", "seed")
+        self._logger.log_params(space | {f"search.{key}": getattr(search, key) for key in keys})
+        self._logger.flush(WAIT_S)
+        self.run_id = self._logger.run_id
+        """Identifier in the tracking store, empty where that cannot be reached: trials then stand alone."""
+        if not self.run_id:
+            print(
+                f"note: {described(self._logger.uri)} cannot be reached; the trials will not be nested below "
+                "the run of the search",
+                file=sys.stderr,
+            )
 
-    @classmethod
-    def begin(cls, search: Search, results: Path) -> ParentRun:
-        """Open the run, or the one of the search that is resumed."""
-        from mlflow.exceptions import MlflowException
-
-        from trainer.tracking import experiment_id, open_client, tracking_uri
-
-        note = results / RUN_FILE
-        try:
-            uri = tracking_uri(None, Path(search.training.root))
-            client = open_client(uri)
-            if note.is_file():
-                run = note.read_text().strip()
-                client.set_terminated(run, "RUNNING")
-                return cls(run, client, search)
-            experiment = experiment_id(client, uri, search.training.experiment)
-            tags = {"tune.search": results.name, "penumbra.folder": str(results)}
-            run = client.create_run(experiment, run_name=f"search {results.name}", tags=tags).info.run_id
-            for key, entry in search.space.items():
-                client.log_param(run, key, f"{entry.kind} {list(entry.values)}"[:500])
-            for key in ("trials", "epochs", "metric", "mode", "reduction", "seed"):
-                client.log_param(run, f"search.{key}", getattr(search, key))
-        except (MlflowException, OSError) as error:
-            print(f"note: the search has no run of its own in the tracking store: {error}", file=sys.stderr)
-            return cls("", None, search)
-        note.write_text(run + "\n")
-        return cls(run, client, search)
+    def _opened(self, folder: Path) -> MLflowTracking:
+        training = self._search.training
+        return MLflowTracking(
+            training.experiment, root=training.root, system_metrics=False, resume_from=str(folder)
+        )
 
     def settle(self, trials: Sequence[Trial]) -> None:
-        """End the runs of trials that were stopped early; their processes had no time for it."""
-        from trainer.tracking import MLflowTracking
-
+        """End the runs of trials whose processes were ended and had no time for it."""
+        training = self._search.training
         for trial in trials:
-            folder = Path(trial.run)
-            if trial.state != STOPPED or not trial.run or not (folder / "run.json").is_file():
-                continue
-            logger = MLflowTracking(
-                self.search.training.experiment, root=self.search.training.root, system_metrics=False,
-                resume_from=str(folder),
-            )  # fmt: skip
-            logger.set_tags({"tune.state": f"stopped after epoch {trial.epoch}"})
-            logger.finalize("success")
+            launch = Launch(launch_of(self._results.name, trial.name), unfinished=True)
+            folder = run_of_launch(launch, Path(training.root), training.experiment)
+            if folder is None:
+                continue  # it ended by itself, or never began
+            logger = self._opened(folder)
+            logger.set_tags({"tune.state": f"{trial.state} after epoch {trial.epoch}"})
+            logger.finalize("success" if trial.state == STOPPED else "failed")
+            if trial.state == STOPPED:
+                end_launch(folder)
 
-    def end(self, trials: Sequence[Trial], files: Sequence[Path]) -> None:
-        """Record what was found, and end the run."""
-        if self.client is None:
-            return
-        from mlflow.exceptions import MlflowException
-
+    def keep(self, trials: Sequence[Trial], files: Sequence[Path]) -> None:
+        """Record what was found."""
         best = next((trial for trial in trials if trial.best), None)
-        try:
-            if best is not None:
-                self.client.log_metric(self.run_id, "best/score", best.score)
-                self.client.log_metric(self.run_id, "best/ms_per_megapixel", best.cost)
-                self.client.set_tag(self.run_id, "tune.best", best.name)
-            for path in files:
-                self.client.log_artifact(self.run_id, str(path))
-            self.client.set_terminated(self.run_id, "FINISHED" if best is not None else "FAILED")
-        except (MlflowException, OSError) as error:
-            print(f"note: the results are not in the tracking store: {error}", file=sys.stderr)
+        if best is not None:
+            found = {"best/score": best.score, "best/ms_per_megapixel": best.cost}
+            trained = sum(trial.state == FINISHED for trial in trials)
+            self._logger.log_metrics(found, trained)  # a search that is resumed finds another best later
+            self._logger.set_tags({"tune.best": best.name})
+        for path in files:
+            self._logger.log_file(path)
+
+    def end(self, trials: Sequence[Trial]) -> None:
+        """End the run, well where nothing was interrupted and a trial was trained."""
+        good = any(trial.best for trial in trials) and all(trial.state != RUNNING for trial in trials)
+        self._logger.finalize("success" if good else "failed")

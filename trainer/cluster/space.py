@@ -100,7 +100,8 @@ def _range(place: str, entry: Any) -> Range:
 
 def options(values: dict[str, Any]) -> list[str]:
     """Return the options of `trainer fit` that set values."""
-    return [part for key, value in sorted(values.items()) for part in (f"--{key}", _text(value))]
+    # In one word: a parser of options takes a lone -1e-05 for another option.
+    return [f"--{key}={_text(value)}" for key, value in sorted(values.items())]
 
 
 def _text(value: Any) -> str:

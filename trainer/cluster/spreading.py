@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from data.jobs import Done, Job, run_elsewhere
-from trainer.cluster.board import Board, follow, sending
-from trainer.cluster.engine import Cluster, connected, enter, forwarded
+from trainer.cluster.board import conduct, reason, sending
+from trainer.cluster.engine import Cluster, enter, forwarded
 
 BEAT_S = 0.5
 """Seconds after which a command hears that its jobs still run."""
@@ -71,18 +71,8 @@ def submit_verb(
         OSError: The cluster cannot be reached.
         KeyboardInterrupt: Ctrl-C, after the jobs were cancelled.
     """
-    cluster = Cluster(address, spread.workers * spread.cpus, spread.workers * spread.gpus)
-    with connected(cluster) as ray:
-        board = ray.remote(num_cpus=0)(Board).remote()
-        head = ray.remote(num_cpus=0)(_Conductor).remote()
-        call = head.run.remote(verb, list(arguments), spread, str(folder), forwarded(address), board)
-        try:
-            code, message = follow(ray, board, call)
-        finally:
-            ray.kill(head)
-    if message:
-        print(f"error: {message}", file=sys.stderr)
-    return code
+    cluster = Cluster(address, spread.workers, spread.cpus, spread.gpus, together=False)
+    return conduct(cluster, _Conductor, verb, list(arguments), spread, str(folder), forwarded(address))
 
 
 class _Conductor:
@@ -161,16 +151,16 @@ class RayJobs:
                 raise KeyboardInterrupt
             for reference in ended:
                 job, tries = running.pop(reference)
-                result, reason = _result(ray, reference)
-                if reason is None:
+                result, failure = _result(ray, reference)
+                if failure is None:
                     done(job, result)
                 elif tries < self._spread.retries:
-                    print(f"{job.name} failed and is made again: {reason}", file=sys.stderr)
+                    print(f"{job.name} failed and is made again: {failure}", file=sys.stderr)
                     waiting.append((job, tries + 1))
                     time.sleep(min(2.0**tries, 8.0) if not running else 0)
                 else:
-                    print(f"{job.name} failed: {reason}", file=sys.stderr)
-                    failed[job.name] = reason
+                    print(f"{job.name} failed: {failure}", file=sys.stderr)
+                    failed[job.name] = failure
             if not ended:
                 done(None, None)
         if failed:
@@ -201,10 +191,8 @@ def _do(job: Job, folder: str, environment: dict[str, str]) -> tuple[bool, Any]:
 def _result(ray: Any, reference: Any) -> tuple[Any, str | None]:
     try:
         good, result = ray.get(reference)
-    except ray.exceptions.WorkerCrashedError:
-        return None, "its process died (killed, out of memory, or its node went away)"
     except ray.exceptions.RayError as error:
-        return None, str(error).strip().splitlines()[-1][:300]
+        return None, reason(error)
     return (result, None) if good else (None, str(result))
 
 

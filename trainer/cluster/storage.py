@@ -8,9 +8,9 @@ Every file is sent whole or not at all, and the newest wins. Of one moment, file
 
     checkpoints, how far the tracking store has the journal, the journal, the files that it names
 
-and sent in the order: run and launch, files, journal, how far the store has it, checkpoints. So the mirror,
-whenever its sender dies, has a journal that knows all steps of its checkpoint and all that the store has, and
-every file that the journal names.
+and sent in the order: run and launch, files, their list, journal, how far the store has it, checkpoints. So
+the mirror, whenever its sender dies, has a journal that knows all steps of its checkpoint and all that the
+store has, and every file that the journal names.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ import re
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -35,16 +34,13 @@ from trainer.cluster.restoring import CHECKPOINTS, NOTHING, kept_files, reached,
 from trainer.spool.journal import SPOOL
 
 LIST = "mirror.json"
-LIST_LIMIT = 1 << 20
+LIST_LIMIT = 16 << 20
 """Bytes of a list of files, at most."""
 
 FIRST = (runs.RUN_FILE, runs.LAUNCH_FILE)
 LAST = "checkpoints/last.ckpt"
 JOURNAL = f"{SPOOL}/journal.jsonl"
 SENT = f"{SPOOL}/sent.json"
-SETTLE_S = 0.3
-"""Seconds between the copies of a checkpoint and of the journal: the numbers of the step after which a
-checkpoint is saved are recorded just after that."""
 
 
 def storage_url(storage: str) -> str:
@@ -69,17 +65,19 @@ def send_run(folder: Path, storage: str, sent: dict[str, tuple[int, int]], every
     Raises:
         OSError: The storage cannot be written.
     """
-    scratch = folder / ".mirror"
+    place, scratch = run_url(folder, storage), folder / ".mirror"
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         held = _hold_changed(folder, scratch, sent, everything)
         for name in sorted(held, key=_rank):
-            send(scratch / name, join(run_url(folder, storage), name))
+            if name == JOURNAL:
+                _send_json(join(place, LIST), {"files": sorted(sent)})
+            send(scratch / name, join(place, name))
             sent[name] = held[name]
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     if held:
-        _send_json(join(run_url(folder, storage), LIST), {"files": sorted(sent)})
+        _send_json(join(place, LIST), {"files": sorted(sent)})
         launch = runs.noted_launch(folder)
         if launch:
             run = {"experiment": folder.parent.name, "name": folder.name, "finished": launch.get("finished")}
@@ -110,9 +108,7 @@ def _hold_changed(
     if not (folder / runs.RUN_FILE).is_file():
         return held
     hold(kept_files(folder, CHECKPOINTS))
-    if held:
-        time.sleep(SETTLE_S)
-    elif not everything:
+    if not held and not everything:
         return held
     rest = [name for name in kept_files(folder) if not name.endswith(".ckpt")]
     hold(sorted(rest, key=JOURNAL.__eq__))  # last
@@ -162,7 +158,8 @@ def bring_run(place: str, folder: Path, newer_than: tuple[int, int] = NOTHING) -
     if not all(_plain(part) for entry in names for part in entry.split("/")):
         raise ValueError(f"{join(place, LIST)} names files outside of the run")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    # Beside the experiment: what a kill leaves of it is not taken for a run.
+    scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent.parent))
     try:
         for entry in names:
             (scratch / entry).parent.mkdir(parents=True, exist_ok=True)

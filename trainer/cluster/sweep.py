@@ -14,17 +14,31 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from trainer.cluster.board import Board, follow, sending
+from trainer.cluster.board import conduct, reason, sending
 from trainer.cluster.checked import Training
-from trainer.cluster.engine import Cluster, connected, enter, forwarded
+from trainer.cluster.engine import Cluster, enter, forwarded
 from trainer.cluster.fitting import Group, resources
-from trainer.cluster.outcome import FAILED, FINISHED, RUNNING, STOPPED, Trial, ranked, table, write_results
+from trainer.cluster.outcome import (
+    FAILED,
+    FINISHED,
+    RUNNING,
+    STOPPED,
+    Trial,
+    brief,
+    ranked,
+    table,
+    write_results,
+)  # fmt: skip
 from trainer.cluster.space import Range
 from trainer.cluster.trials import Sweep, run_trial
+from trainer.outputs import write_whole
+from trainer.runs import new_folder
+from trainer.spool.journal import shown
 
 STATE = "ray"
 SWEEP_FILE = "search.json"
@@ -46,6 +60,7 @@ class Search:
         reduction: One in so many trials goes on at each of ASHA's rungs; 0: all are trained to the end.
         seed: Of the search.
         concurrent: Trials at one time, at most; 0: what the cluster has room for.
+        folder: Working folder of the trials.
     """
 
     training: Training
@@ -59,10 +74,11 @@ class Search:
     reduction: int
     seed: int
     concurrent: int = 0
+    folder: str = ""
 
     def save(self, folder: Path) -> None:
         """Write the search into its folder."""
-        (folder / SWEEP_FILE).write_text(json.dumps(asdict(self), indent=1) + "\n")
+        write_whole(folder / SWEEP_FILE, json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> Search:
@@ -85,98 +101,92 @@ class Search:
             raise ValueError(f"{path} is damaged: {error}") from None
 
 
-def run_search(search: Search, results: Path, address: str | None, folder: Path, resume: bool) -> int:
+def run_search(search: Search, address: str | None, results: Path | None = None) -> int:
     """Run a search on Ray and print how it goes; returns the exit code.
 
     Args:
         search: What to search.
-        results: Folder of the search.
         address: A running Ray, or None for one on this machine.
-        folder: Working folder of the trials.
-        resume: Go on with the trials that are there.
+        results: Folder of a search that is resumed; None: a new one is made.
 
     Raises:
-        ValueError: Ray is missing, or the cluster has another release.
+        ValueError: Ray is missing, or the cluster has another release, or too little for a trial.
         OSError: The cluster cannot be reached.
         KeyboardInterrupt: Ctrl-C, after the search was stopped.
     """
     group = search.group
-    with connected(Cluster(address, group.workers * group.cpus, group.workers * group.gpus)) as ray:
-        board = ray.remote(num_cpus=0)(Board).remote()
-        head = ray.remote(num_cpus=0)(_Searcher).remote()
-        call = head.run.remote(search, str(results), str(folder), forwarded(address), resume, board)
-        try:
-            code, message = follow(ray, board, call)
-        finally:
-            ray.kill(head)
-    if message:
-        print(f"error: {message}", file=sys.stderr)
-    return code
+    cluster = Cluster(address, group.workers, group.cpus, group.gpus)
+    return conduct(cluster, _Searcher, search, str(results or ""), forwarded(address))
 
 
 class _Searcher:
     """Conducts a search from within the cluster."""
 
-    def run(
-        self, search: Search, results: str, folder: str, environment: dict[str, str], resume: bool, board: Any
-    ) -> None:
+    def run(self, search: Search, results: str, environment: dict[str, str], board: Any) -> None:
         """Run the trials, and write what they found."""
         import ray
 
         with sending(board):
             try:
-                enter(folder, environment)
-                code, message = _conduct(search, Path(results), folder, environment, resume, board), ""
+                enter(search.folder, environment)
+                code, message = _conduct(search, results, environment, board), ""
             except (ValueError, OSError) as error:
                 code, message = 1, str(error)
         ray.get(board.end.remote(code, message))
 
 
-def _conduct(
-    search: Search, results: Path, folder: str, environment: dict[str, str], resume: bool, board: Any
-) -> int:
+def _conduct(search: Search, folder: str, environment: dict[str, str], board: Any) -> int:
     from trainer.cluster.parent import ParentRun
 
-    results.mkdir(parents=True, exist_ok=True)
-    search.save(results)
-    parent = ParentRun.begin(search, results)
     training, group = search.training, search.group
-    sweep = Sweep(
-        results.name, training, group, folder, environment, search.metric, search.mode, parent.run_id
-    )
+    results = Path(folder) if folder else new_folder(Path(training.root), "tune").absolute()
+    search.save(results)
+    parent = ParentRun(search, results)
+    names = (search.folder, environment, search.metric, search.mode, parent.run_id)
+    sweep = Sweep(results.name, training, group, *names)
     threading.Thread(target=_interrupt, args=(board,), daemon=True).start()
-    grid = _tuner(search, sweep, results, resume).fit()
-    trials = ranked([_trial(result, search) for result in grid], search.mode)
+    trials: list[Trial] = []
+    try:
+        grid = _tuner(search, sweep, results, bool(folder)).fit()
+        trials = ranked([_trial(result) for result in grid], search.mode)
+        return _tell(search, results, trials, parent)
+    finally:
+        parent.end(trials)
+
+
+def _tell(search: Search, results: Path, trials: list[Trial], parent: Any) -> int:
+    """Print and keep what a search has found; returns its exit code."""
     parent.settle(trials)
     written = write_results(results, trials, search.metric, search.mode)
     print(table(trials, search.metric), flush=True)
+    parent.keep(trials, written)
     best = next((trial for trial in trials if trial.best), None)
-    parent.end(trials, written)
     if any(trial.state == RUNNING for trial in trials):
-        print(f"next: trainer tune --resume {_shown(results)}", flush=True)
+        print(f"next: trainer tune --resume {shown(results)}", flush=True)
     print(f"results: {results} ({', '.join(path.name for path in written)})", flush=True)
     if (results / "best.yaml").is_file() and best is not None:
-        print(f"next: trainer fit --config {_shown(results / 'best.yaml')}", flush=True)
+        print(f"next: trainer fit --config {shown(results / 'best.yaml')}", flush=True)
     return 0 if best is not None else 1
 
 
 def _interrupt(board: Any) -> None:
-    """Interrupt Ray Tune as Ctrl-C does when the submitter asks for it; it then keeps its state."""
+    """Interrupt Ray Tune when the submitter asks for it; it then keeps its state.
+
+    By the signal that it takes beside Ctrl-C's: processes of a cluster have that one blocked.
+    """
     import ray
 
-    while not ray.get(board.cancelled.remote()):
+    while not ray.get(board.cancelled.remote()) or not callable(signal.getsignal(signal.SIGUSR1)):
         time.sleep(1.0)
-    os.kill(os.getpid(), signal.SIGINT)
-
-
-def _shown(path: Path) -> str:
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+    os.kill(os.getpid(), signal.SIGUSR1)
 
 
 def _tuner(search: Search, sweep: Sweep, results: Path, resume: bool) -> Any:
+    import optuna
     from ray import tune
     from ray.tune.search.optuna import OptunaSearch
 
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     trainable = tune.with_resources(tune.with_parameters(run_trial, sweep=sweep), _resources(search.group))
     state = results / STATE
     if resume and tune.Tuner.can_restore(str(state)):
@@ -233,7 +243,7 @@ def _telling(search: Search) -> Any:
         """Prints a line for what happens to trials."""
 
         def on_trial_start(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-            values = ", ".join(f"{key.rpartition('.')[2]} {_plain(v)}" for key, v in trial.config.items())
+            values = ", ".join(f"{key.rpartition('.')[2]} {brief(v)}" for key, v in trial.config.items())
             _say(f"{len(trials)}/{search.trials} {trial.trial_id} starts: {values}")
 
         def on_trial_result(
@@ -245,8 +255,7 @@ def _telling(search: Search) -> Any:
             )
 
         def on_trial_complete(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
-            state = _state(trial.last_result.get("epoch", 0), search)
-            _say(f"{trial.trial_id} {state}")
+            _say(f"{trial.trial_id} {_state(trial.last_result)}")
 
         def on_trial_error(self, iteration: int, trials: Any, trial: Any, **info: Any) -> None:
             _say(f"{trial.trial_id} failed: {_why(trial)}")
@@ -258,21 +267,16 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _plain(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
 def _why(trial: Any) -> str:
-    error = trial.get_error()
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1][:300] if lines else "its process died"
+    return reason(trial.get_error() or "its process died")
 
 
-def _state(epoch: int, search: Search) -> str:
-    return FINISHED if epoch >= search.epochs else STOPPED
+def _state(numbers: Mapping[str, Any]) -> str:
+    """Return what became of a trial that has ended, by its last report."""
+    return FINISHED if numbers.get("trained") else STOPPED
 
 
-def _trial(result: Any, search: Search) -> Trial:
+def _trial(result: Any) -> Trial:
     numbers = result.metrics or {}
     trial = Trial(str(numbers.get("trial_id") or Path(str(result.path)).name), dict(result.config or {}))
     if "epoch" in numbers:
@@ -282,7 +286,7 @@ def _trial(result: Any, search: Search) -> Trial:
             cost=float(numbers["cost"]),
             epoch=int(numbers["epoch"]),
             run=str(numbers["run"]),
-            state=_state(int(numbers["epoch"]), search) if numbers.get("done") else RUNNING,
+            state=_state(numbers) if numbers.get("done") or numbers.get("trained") else RUNNING,
         )
     if result.error is not None:
         return replace(trial, state=FAILED)

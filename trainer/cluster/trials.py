@@ -22,6 +22,7 @@ from trainer.cluster.engine import enter
 from trainer.cluster.fitting import Group, resources
 from trainer.cluster.space import options
 from trainer.cluster.worker import ExtendedCLI
+from trainer.runs import TRAINING_VARIABLE
 from trainer.tracking import MLflowTracking
 
 COST = "cost/ms_per_megapixel"
@@ -54,6 +55,11 @@ class Sweep:
     metric: str
     mode: str
     parent: str = ""
+
+
+def launch_of(search: str, trial: str) -> str:
+    """Return the launch of a trial, by which one that is started again finds its run."""
+    return f"tune {search} {trial}"
 
 
 def run_trial(values: dict[str, Any], sweep: Sweep) -> None:
@@ -110,7 +116,7 @@ def train_trial(
         report: Called after every validation.
         cli: The training command.
     """
-    enter(sweep.folder, {**sweep.environment, "PENUMBRA_LAUNCH": f"tune {sweep.name} {identity}"})
+    enter(sweep.folder, {**sweep.environment, TRAINING_VARIABLE: launch_of(sweep.name, identity)})
     from lightning.pytorch.utilities import rank_zero_only
 
     from trainer.training import quiet_libraries
@@ -119,28 +125,31 @@ def train_trial(
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "0")) or sweep.group.cpus)
     quiet_libraries()
     training = replace(sweep.training, arguments=(*sweep.training.arguments, *options(values)))
-    cli.left_out, cli.extra = LEFT_OUT, (Reporting(sweep, identity, values, report),)
+    reporting = Reporting(sweep, identity, report)
+    cli.left_out, cli.extra = LEFT_OUT, (reporting,)
     with tempfile.TemporaryDirectory(prefix="penumbra-config-") as folder:
         sys.argv = ["trainer", "fit", *training.restored(Path(folder))]
         cli()
+    reporting.finish()
 
 
 class Reporting(Callback):
     """Measures what a network costs before it is trained, and reports cost and best score.
 
+    What the last epoch gives is reported when the run has ended: a trial whose report falls behind is ended
+    at once, and would lack the end of a training that was made to the end.
+
     Args:
         sweep: What all trials have in common.
         identity: Name of the trial.
-        values: What it was given.
         report: Called after every validation, on every rank.
     """
 
-    def __init__(
-        self, sweep: Sweep, identity: str, values: dict[str, Any], report: Callable[[dict[str, Any]], None]
-    ) -> None:
-        self._sweep, self._identity, self._values, self._report = sweep, identity, values, report
+    def __init__(self, sweep: Sweep, identity: str, report: Callable[[dict[str, Any]], None]) -> None:
+        self._sweep, self._identity, self._report = sweep, identity, report
         self._cost = float("nan")
         self._best: float | None = None
+        self._run, self._epochs = "", 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a trial that is started again needs to know."""
@@ -150,18 +159,23 @@ class Reporting(Callback):
         """Take the state of an earlier attempt."""
         self._best = state_dict["best"]
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Measure the cost, and make the run part of the search's."""
         self._cost = ms_per_megapixel(pl_module.net)  # type: ignore[arg-type]
         logger = trainer.logger
         if trainer.is_global_zero and isinstance(logger, MLflowTracking):
+            self._run = str(logger.folder)
             tags = {"tune.search": self._sweep.name, "tune.trial": self._identity}
             tags |= {"mlflow.parentRunId": self._sweep.parent} if self._sweep.parent else {}
             logger.set_tags(tags)
             logger.log_metrics({COST: self._cost}, 0)
 
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note how many epochs were trained."""
+        self._epochs = trainer.current_epoch
+
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Report.
+        """Report where another validation follows.
 
         Raises:
             ValueError: The metric is not among what validation logs.
@@ -175,23 +189,32 @@ class Reporting(Callback):
         score = float(found[self._sweep.metric])
         pick = max if self._sweep.mode == "max" else min
         self._best = score if self._best is None else pick(self._best, score)
-        logger = trainer.logger
-        run = str(logger.folder) if trainer.is_global_zero and isinstance(logger, MLflowTracking) else ""
-        self._report(
-            {
-                "score": self._best,
-                "cost": self._cost,
-                "epoch": trainer.current_epoch + 1,
-                "run": run,
-                "node": os.uname().nodename,
-            }
-        )
+        epoch = trainer.current_epoch + 1
+        if epoch + (trainer.check_val_every_n_epoch or 1) <= (trainer.max_epochs or 0):
+            self._tell(epoch)
+
+    def finish(self) -> None:
+        """Report the end of the training.
+
+        Raises:
+            ValueError: There was no validation.
+        """
+        if self._best is None:
+            raise ValueError(
+                "no epoch was validated, so that the trial has no score; give a --trainer."
+                "check_val_every_n_epoch that is no larger than --trainer.max_epochs"
+            )
+        self._tell(self._epochs, trained=True)
+
+    def _tell(self, epoch: int, trained: bool = False) -> None:
+        numbers = {"score": self._best, "cost": self._cost, "epoch": epoch, "trained": trained}
+        self._report({**numbers, "run": self._run, "node": os.uname().nodename})
 
 
 def ms_per_megapixel(net: Denoiser) -> float:
     """Return the milliseconds per megapixel of a network in its deployed form, on this process's threads.
 
-    The smallest of some measurements counts, which other work on the machine disturbs least.
+    The median of the smaller half of some measurements counts, which other work disturbs least.
     """
     from trainer.export.entry import Sampled, example
 

@@ -56,6 +56,14 @@ def _hooks(given: Any) -> dict[str, Any]:
     return {name: getattr(given, f"_{name}") for name in names}
 
 
+class Cancelled(Exception):  # noqa: N818  # no error
+    """The submitter asked for the end of a training.
+
+    Not a KeyboardInterrupt: Lightning then changes the handling of signals, which only the main thread may
+    do, and Ray trains in another one.
+    """
+
+
 class Cancelling(Callback):
     """Ends a training as Ctrl-C does when its submitter asks for it.
 
@@ -78,10 +86,15 @@ class Cancelling(Callback):
         """Stop between two steps.
 
         Raises:
-            KeyboardInterrupt: The submitter asked for it.
+            Cancelled: The submitter asked for it.
         """
         if self._asked.is_set():
-            raise KeyboardInterrupt
+            raise Cancelled
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Say how the run continues."""
+        if isinstance(exception, Cancelled):
+            print(f"interrupted at step {trainer.global_step}; continue with --ckpt_path last")
 
     def _look(self) -> None:
         import ray

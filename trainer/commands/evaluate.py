@@ -6,9 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from trainer.commands.denoise import size_in_bytes
+from trainer.options import AddModel, AddOption
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,35 +21,20 @@ if TYPE_CHECKING:
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
 
 
-class _Model(argparse.Action):
-    """Begins a method; options that follow are its own."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        namespace.models = [*(namespace.models or []), (values, [])]
-
-
-class _Option(argparse.Action):
-    """Adds an option to the last method."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        if not namespace.models:
-            parser.error(f"--option {values}: expected after the --model that it is for")
-        namespace.models[-1][1].append(values)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options."""
     parser.add_argument(
         "--model",
         dest="models",
-        action=_Model,
+        action=AddModel,
         required=True,
         metavar="[LABEL=]MODEL",
         help="a method, as of `trainer denoise`, or OIDN; repeat it for each; LABEL is its name in tables",
     )
     parser.add_argument(
         "--option",
-        action=_Option,
+        dest="models",
+        action=AddOption,
         metavar="KEY=VALUE",
         help="option of the --model before it, where that is named by its class, such as preset=paper",
     )
@@ -83,6 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=1, metavar="N", help="processes that take metrics meanwhile (default: 1)"
     )
+    parser.add_argument(
+        "--no-costs", action="store_true", help="do not measure time and memory of the methods"
+    )
     parser.add_argument("--no-track", action="store_true", help="do not record the evaluation in MLflow")
     parser.add_argument(
         "--register-champion",
@@ -114,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from trainer.commands.denoise import check_device
     from trainer.evaluation.champion import champions_beside
+    from trainer.evaluation.costs import cost_table, costs_of
     from trainer.evaluation.plan import clips_of, methods_of
     from trainer.evaluation.record import rows_of, write_record, write_rows, write_tables
     from trainer.evaluation.running import Evaluation, Setting
@@ -121,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     from trainer.loading import model_store
     from trainer.outputs import make_folder
     from trainer.progress import FrameProgress
+    from trainer.reports.comparison import write_page
 
     check_device(args.device)
     metrics = _metrics(args.metrics)
@@ -146,14 +137,21 @@ def run(args: argparse.Namespace) -> int:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
     write_rows(rows, args.output)
-    tables = write_tables(rows, [o.method.label for o in outcomes], setting)
-    write_record(outcomes, rows, setting, {})
+    costs = {} if args.no_costs else costs_of(outcomes, rows, setting, _say)
+    table = cost_table(costs, outcomes)
+    tables = write_tables(rows, [o.method.label for o in outcomes], setting, [table] if table else [])
+    write_record(outcomes, rows, setting, costs)
+    write_page(args.output)
     _print(outcomes, tables, setting)
     if not args.no_track:
         _track(outcomes, rows, setting)
     if args.register_champion:
         _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
     return _status(outcomes, args.strict)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _share(text: str) -> float:
@@ -272,7 +270,7 @@ def _print(outcomes: Sequence[Outcome], tables: Sequence[Table], setting: Settin
     lacking = sum(not row.get("reference", True) for row in outcomes[0].rows.values())
     if lacking:
         print(f"{lacking} frames have no reference: denoised, without metrics", file=sys.stderr)
-    print(f"written to {setting.folder}", file=sys.stderr)
+    print(f"written to {setting.folder}; look at {setting.folder / 'report.html'}", file=sys.stderr)
 
 
 def _status(outcomes: Sequence[Outcome], strict: bool) -> int:

@@ -240,7 +240,7 @@ def _without_normal(index: Index) -> int:
 @contextmanager
 def _progress(title: str, unit: str) -> Iterator[Progress]:
     """Yield a bar on a terminal, and something that prints lines elsewhere."""
-    from data.shards.progress import LineProgress, Rate
+    from data.progress import LineProgress, Rate
 
     if not sys.stderr.isatty():
         yield LineProgress(title, unit=unit)

@@ -6,6 +6,10 @@ import argparse
 import importlib
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from trainer.cluster.fitting import Group
 
 HELP = "run a training, or many independent jobs, on a Ray cluster"
 
@@ -37,23 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "whose node is lost goes on from there",
     )
     parser.add_argument(
-        "--max-failures", type=int, default=3, metavar="N", help="restarts after lost workers (default 3)"
+        "--max-failures", type=int, metavar="N", help="restarts after lost workers (default 3)"
     )
 
 
 def add_cluster_options(parser: argparse.ArgumentParser) -> None:
     """Define which cluster is used, and how many of its processes."""
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
-    parser.add_argument(
-        "--cpus-per-worker", type=int, default=1, metavar="C", help="cores of each (default 1)"
-    )
-    parser.add_argument(
-        "--gpus-per-worker", type=float, default=0, metavar="G", help="GPUs of each (default 0)"
-    )
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default 1)")
+    parser.add_argument("--cpus-per-worker", type=int, metavar="C", help="cores of each (default 1)")
+    parser.add_argument("--gpus-per-worker", type=float, metavar="G", help="GPUs of each (default 0)")
     parser.add_argument(
         "--address",
         metavar="URL",
-        help="a running Ray: ray://HOST:10001, HOST:6379 or auto (default: start one)",
+        help="a running Ray: ray://HOST:10001 from any machine, auto or HOST:6379 on one of its nodes "
+        "(default: start one)",
     )
     parser.add_argument(
         "--folder",
@@ -74,33 +75,48 @@ def run(args: argparse.Namespace) -> int:
     from trainer.cluster.engine import need_ray
     from trainer.configs import UsageError
 
-    check_cluster_options(args)
+    group = group_of(args, max_failures=3)
     verb, rest = _verb(args.rest)
     need_ray()
     folder = Path(os.path.abspath(args.folder or Path.cwd()))
     if verb == "fit":
         from trainer.cluster.checked import check_training
-        from trainer.cluster.fitting import Group, submit_training
+        from trainer.cluster.fitting import submit_training
 
-        group = Group(args.workers, args.cpus_per_worker, args.gpus_per_worker, args.max_failures)
         return submit_training(check_training(rest), group, args.address, folder, args.storage)
     if args.storage is not None:
         raise UsageError(f"--storage is for trainings; {verb} writes to its --output")
     from trainer.cluster.spreading import Spread, check_verb, submit_verb
 
     check_verb(verb, rest)
-    spread = Spread(args.workers, args.cpus_per_worker, args.gpus_per_worker, args.max_failures)
+    spread = Spread(group.workers, group.cpus, group.gpus, group.max_failures)
     return submit_verb(verb, rest, spread, args.address, folder)
 
 
-def check_cluster_options(args: argparse.Namespace) -> None:
-    """Raise a UsageError where a number is out of range."""
+def group_of(args: argparse.Namespace, max_failures: int) -> Group:
+    """Return the processes that the options ask for.
+
+    Args:
+        args: The options; those that were not given are None.
+        max_failures: What is meant where that is not given.
+
+    Raises:
+        UsageError: A number is out of range.
+    """
+    from trainer.cluster.fitting import Group
     from trainer.configs import UsageError
 
-    for name, least in (("workers", 1), ("cpus_per_worker", 1), ("gpus_per_worker", 0), ("max_failures", 0)):
-        if getattr(args, name, least) < least:
+    found = []
+    for name, default, least in (
+        ("workers", 1, 1), ("cpus_per_worker", 1, 1), ("gpus_per_worker", 0, 0),
+        ("max_failures", max_failures, 0),
+    ):  # fmt: skip
+        value = getattr(args, name)
+        if value is not None and value < least:
             option = "--" + name.replace("_", "-")
-            raise UsageError(f"{option} {getattr(args, name)}: expected at least {least}")
+            raise UsageError(f"{option} {value}: expected at least {least}")
+        found.append(default if value is None else value)
+    return Group(*found)
 
 
 def _verb(rest: list[str]) -> tuple[str, list[str]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from trainer.cluster.fitting import Group
     from trainer.cluster.sweep import Search
 
 HELP = "search hyper-parameters with Ray Tune"
@@ -51,11 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-early-stop", action="store_true", help="train all trials to the end, for a fair Pareto front"
     )
-    parser.add_argument("--concurrent", type=int, default=0, metavar="N", help="trials at one time, at most")
-    parser.add_argument("--search-seed", type=int, default=1, metavar="N", help="of the search (default 1)")
+    parser.add_argument("--concurrent", type=int, metavar="N", help="trials at one time, at most")
+    parser.add_argument("--search-seed", type=int, metavar="N", help="of the search (default 1)")
     parser.add_argument("--resume", metavar="DIR", type=Path, help="go on with the search in this folder")
     parser.add_argument(
-        "--max-failures", type=int, default=1, metavar="N", help="restarts of a trial that fails (default 1)"
+        "--max-failures", type=int, metavar="N", help="restarts of a trial that fails (default 1)"
     )
     add_cluster_options(parser)
 
@@ -69,39 +70,56 @@ def run(args: argparse.Namespace) -> int:
         OSError: The cluster cannot be reached.
     """
     from trainer.cluster.engine import need_ray
-    from trainer.commands.submit import check_cluster_options
+    from trainer.commands.submit import group_of
 
-    check_cluster_options(args)
+    group = group_of(args, max_failures=1)
     need_ray()
-    folder = Path(os.path.abspath(args.folder or Path.cwd()))
     from trainer.cluster.sweep import run_search
 
-    if args.resume is not None:
-        results = Path(os.path.abspath(args.resume))
-        search = _resumed(args, results)
-    else:
-        search = _search(args)
-        results = _new_folder(folder / search.training.root / "tune")
-    return run_search(search, results, args.address, folder, args.resume is not None)
+    if args.resume is None:
+        return run_search(_search(args, group), args.address)
+    results = Path(os.path.abspath(args.resume))
+    return run_search(_resumed(args, results), args.address, results)
 
 
 def _resumed(args: argparse.Namespace, results: Path) -> Search:
+    """Return a search as it was begun; only how many of its trials run at one time may change.
+
+    Raises:
+        UsageError: An option asks for something else.
+        ValueError: There is no search.
+    """
     from trainer.cluster.sweep import Search
     from trainer.configs import UsageError
 
-    given = [word for word in args.rest if word.startswith("-")]
-    given += [f"--{name}" for name in ("space", "metric", "mode", "grace", "trials") if getattr(args, name)]
-    if given:
-        raise UsageError(
-            f"{given[0]}: --resume goes on with the search as it was begun; leave the option out"
-        )
     search = Search.load(results)
-    return replace(search, concurrent=args.concurrent or search.concurrent)
+    group = search.group
+    begun = {
+        "trials": search.trials, "metric": search.metric, "mode": search.mode, "grace": search.grace,
+        "search_seed": search.seed, "workers": group.workers, "cpus_per_worker": group.cpus,
+        "gpus_per_worker": group.gpus, "max_failures": group.max_failures,
+        "no_early_stop": not search.reduction,
+    }  # fmt: skip
+    for name, value in begun.items():
+        given = getattr(args, name)
+        if given is not None and given is not False and given != value:
+            option = "--" + name.replace("_", "-")
+            option, was = (option, "without") if given is True else (f"{option} {given}", f"with {value}")
+            raise UsageError(
+                f"{option}: the search in {args.resume} was begun {was}, and --resume goes on with it as it "
+                "was; leave the option out, or begin a new search"
+            )
+    other = ["--space"] * (args.space is not None) + [word for word in args.rest if word.startswith("-")]
+    if other:
+        raise UsageError(
+            f"{other[0]}: --resume goes on with the search as it was begun; leave the option out"
+        )
+    folder = os.path.abspath(args.folder) if args.folder else search.folder or os.getcwd()
+    return replace(search, concurrent=args.concurrent or search.concurrent, folder=folder)
 
 
-def _search(args: argparse.Namespace) -> Search:
+def _search(args: argparse.Namespace, group: Group) -> Search:
     from trainer.cluster.checked import check_training, parsed
-    from trainer.cluster.fitting import Group
     from trainer.cluster.space import check_space, find_space, read_space
     from trainer.cluster.sweep import Search
     from trainer.configs import UsageError, resolve_arguments
@@ -120,10 +138,9 @@ def _search(args: argparse.Namespace) -> Search:
             raise UsageError(f"{name} {value}: expected 1{most}")
     check_space(space, args.rest, path)
     return Search(
-        training, space, trials,
-        Group(args.workers, args.cpus_per_worker, args.gpus_per_worker, args.max_failures),
-        args.metric or "val/psnr_wskp", args.mode or "max", epochs, grace,
-        0 if args.no_early_stop else 3, args.search_seed, args.concurrent,
+        training, space, trials, group, args.metric or "val/psnr_wskp", args.mode or "max", epochs, grace,
+        0 if args.no_early_stop else 3, 1 if args.search_seed is None else args.search_seed,
+        args.concurrent or 0, os.path.abspath(args.folder or Path.cwd()),
     )  # fmt: skip
 
 
@@ -134,13 +151,3 @@ def _epochs(trainer: Any) -> int:
     if epochs is None or epochs < 1:
         raise UsageError("a search compares trials by epochs: give --trainer.max_epochs N")
     return int(epochs)
-
-
-def _new_folder(parent: Path) -> Path:
-    from trainer.runs import new_name
-
-    name = new_name()
-    number = 0
-    while (parent / (name if not number else f"{name}-{number}")).exists():
-        number += 1
-    return parent / (name if not number else f"{name}-{number}")

@@ -121,13 +121,21 @@ def _number(value: Any) -> int | None:
     return None if pd.isna(value) else int(value)
 
 
-def write_tables(rows: pd.DataFrame, methods: Sequence[str], setting: Setting) -> list[Table]:
+def write_tables(
+    rows: pd.DataFrame, methods: Sequence[str], setting: Setting, more: Sequence[Table] = ()
+) -> list[Table]:
     """Write all tables below `tables/` and return them.
+
+    Args:
+        rows: One per frame and method.
+        methods: Labels in order.
+        setting: How they were made.
+        more: Other tables, which come first.
 
     Raises:
         OSError: One cannot be written.
     """
-    tables = tables_of(Scored(rows, methods, setting.metrics))
+    tables = [*more, *tables_of(Scored(rows, methods, setting.metrics))]
     folder = setting.folder / "tables"
     folder.mkdir(exist_ok=True)
     for table in tables:

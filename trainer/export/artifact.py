@@ -160,7 +160,13 @@ class _OnnxRuntime:
 
     def __call__(self, feed: dict[str, Tensor]) -> Tensor:
         arrays = {name: np.ascontiguousarray(v.detach().float().cpu().numpy()) for name, v in feed.items()}
-        return torch.from_numpy(self.session.run(None, arrays)[0])
+        try:
+            return torch.from_numpy(self.session.run(None, arrays)[0])
+        except _runtime_errors() as error:
+            first = str(error).splitlines()[0][:200]
+            raise OSError(
+                f"ONNX Runtime cannot run the model ({first}); lower --memory, or export the model again"
+            ) from error
 
 
 class _TorchScript:
@@ -171,6 +177,14 @@ class _TorchScript:
     def __call__(self, feed: dict[str, Tensor]) -> Tensor:
         with torch.inference_mode():
             return self.module({name: value.to(self.device) for name, value in feed.items()})
+
+
+def _runtime_errors() -> tuple[type[Exception], ...]:
+    """Return the errors of ONNX Runtime, which have no class in common."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as states
+
+    found = vars(states).values()
+    return tuple(kind for kind in found if isinstance(kind, type) and issubclass(kind, Exception))
 
 
 def load_artifact(path: Path | str, device: str = "cpu") -> Artifact:
@@ -198,15 +212,10 @@ def is_archive(path: Path) -> bool:
 
 def open_onnx(content: bytes, name: str, device: str = "cpu") -> Artifact:
     """Open the content of an ONNX file; `name` is for messages. Raises as `load_artifact` does."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as states
-
     description = _described(_onnx_metadata(content, name), name)
-
-    broken = (states.InvalidProtobuf, states.InvalidGraph, states.Fail, states.InvalidArgument,
-              states.NoSuchFile, states.NotImplemented)  # fmt: skip
     try:
         runtime = _OnnxRuntime(content, device)
-    except broken as error:
+    except _runtime_errors() as error:
         first = str(error).splitlines()[0][:200]
         raise ValueError(
             f"{name} is not an ONNX or TorchScript file, or is damaged ({first}); export the model again"

@@ -1,6 +1,8 @@
 """`trainer serve`: denoising over HTTP, for files that nobody vouches for.
 
 limits.py     what a request may cost, and how one is refused
+room.py       space in the temporary folder, which all requests share
+memory.py     what all of that may take, compared with what there is
 upload.py     a request's body → a file, counted while it comes in
 archive.py    ZIP files, looked at before anything is unpacked
 reader.py     the process in which files are decoded: memory and time are limited, a crash costs a request

@@ -19,8 +19,7 @@ class Limits:
     Attributes:
         megapixels: Largest frame, in millions of pixels, with up to 32 channels.
         upload: Bytes of a request's body.
-        disk: Bytes of the temporary folder that all requests together may take: uploads, what ZIP files unpack
-            to, results.
+        disk: Bytes of files of all requests together: uploads, what ZIP files unpack to, results.
         frames: Frames of a ZIP file.
         queue: Requests that wait for those that run; as many again may be sending their body.
         read: Seconds that a body may take to come in.
@@ -105,7 +104,7 @@ class Budget:
     """Bytes that requests share: who wants more than is left waits.
 
     Args:
-        total: Bytes; a request that wants more gets all of them.
+        total: Bytes; nobody may want more.
     """
 
     def __init__(self, total: int) -> None:
@@ -119,7 +118,6 @@ class Budget:
         Raises:
             Over: Nobody waits for the result any more.
         """
-        size = min(size, self.total)
         with self._changed:
             while self.held + size > self.total:
                 ticket.check()

@@ -65,7 +65,7 @@ class Protocol(H11Protocol):
         return self.cycle is None or self.cycle.response_complete
 
     def _make_way(self) -> None:
-        """Cut off the connection that has been without a request for longest, rather than refuse a new one."""
+        """Cut off the connection that has been without a request for longest, so that a new one is heard."""
         idle = [
             c
             for c in self.connections

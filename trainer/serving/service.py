@@ -118,8 +118,7 @@ class Service:
 
     async def _answer(self, request: Request, wish: Wish, place: Place) -> Response:
         self._admit(self.admitted + self.sending)
-        length = check_headers(request, self.limits).length
-        self.room.check(length)
+        place.check(check_headers(request, self.limits).length)
         place.upload.mkdir(parents=True)
         self.sending += 1
         try:

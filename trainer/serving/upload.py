@@ -46,8 +46,8 @@ async def receive(request: Request, place: Place, limits: Limits) -> str:
         limits: Of a request.
 
     Raises:
-        Refusal: 400 a malformed form, 408 too slow, 413 too large, 415 another type, 422 nothing in it, 503 no
-            room.
+        Refusal: 400 a malformed form, 408 too slow, 413 too large, 415 another type, 422 nothing in it, 503
+            no room.
         ClientDisconnect: The client went away.
         OSError: The file cannot be written.
     """

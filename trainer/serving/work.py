@@ -102,7 +102,7 @@ class Workshop:
         )
         denoiser = self._denoiser(Clip(items), wish, ticket, notes)
         sink = _Sink(place, name if len(frames) == 1 and str(frames[0]["name"]) == name else None, wish)
-        held = max(sizes.values()) * self._copies(len(items))
+        held = self._held(max(sizes.values()), len(items))
         with self.budget.hold(held, ticket), ExitStack() as stack:
             stack.callback(sink.close)
             for item in items:
@@ -118,10 +118,25 @@ class Workshop:
                     sink.add(done, result)
         return sink.done(tuple(notes))
 
-    def _copies(self, count: int) -> int:
-        """Return how many frames are held at a time."""
+    def _held(self, size: int, count: int) -> int:
+        """Return the bytes of the frames of a sequence that are held at a time.
+
+        Args:
+            size: Bytes of the largest frame.
+            count: Number of frames.
+
+        Raises:
+            Refusal: They are more than all requests may have.
+        """
         model = self.loaded.model
-        return min(count, 1 + 2 * max(model.frame_halo, model.frames)) if model.frames else 1
+        copies = min(count, 1 + 2 * max(model.frame_halo, model.frames)) if model.frames else 1
+        if copies * size > self.budget.total:
+            raise Refusal(
+                422,
+                f"the model sees {copies} frames at a time, which take {copies * size / 1e6:.0f} MB, at most "
+                f"{self.budget.total / 1e6:.0f} MB are taken; send smaller or fewer frames",
+            )
+        return copies * size
 
     def _denoiser(self, clip: Clip, wish: Wish, ticket: Ticket, notes: dict[str, None]) -> ClipDenoiser:
         factor = wish.exposure if isinstance(wish.exposure, float) else None

@@ -14,8 +14,8 @@ def cluster_cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def address(tmp_path_factory, cluster_cache):
-    """Address of two nodes whose processes share the prepared samples."""
+def nodes(tmp_path_factory, cluster_cache):
+    """Two nodes whose processes share the prepared samples: their address, and what loses one of them."""
     place = Workplace(tmp_path_factory.mktemp("nodes"), cluster_cache)
     process = subprocess.Popen(  # its input ends with this process too
         [sys.executable, "-m", "tests.trainer.cluster.two_nodes"], env=place.environment,
@@ -24,7 +24,7 @@ def address(tmp_path_factory, cluster_cache):
     address = process.stdout.readline().strip()
     try:
         assert address, "the cluster did not start"
-        yield address
+        yield address, lambda: print(file=process.stdin, flush=True)
     finally:
         process.stdin.close()
         try:
@@ -36,11 +36,11 @@ def address(tmp_path_factory, cluster_cache):
 
 
 @pytest.fixture(scope="session")
-def submitting(tmp_path_factory, cluster_cache, address):
+def submitting(tmp_path_factory, cluster_cache, nodes):
     """Make a workplace, and the beginning of a command line that runs on both nodes."""
 
     def make(name):
         place = Workplace(tmp_path_factory.mktemp(name), cluster_cache)
-        return place, ("submit", "--address", address, "--workers", "2")
+        return place, ("submit", "--address", nodes[0], "--workers", "2")
 
     return make

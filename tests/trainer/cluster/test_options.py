@@ -7,8 +7,13 @@ import pytest
 
 from trainer import configs
 from trainer.cli import main
-from trainer.cluster.checked import check_training, strategy_options
-from trainer.cluster.space import check_space, find_space, read_space
+from trainer.cluster.board import reason
+from trainer.cluster.checked import Training, check_training, strategy_options
+from trainer.cluster.engine import Cluster, _check_room
+from trainer.cluster.fitting import Group
+from trainer.cluster.space import Range, check_space, find_space, options, read_space
+from trainer.cluster.sweep import Search
+from trainer.commands import tune
 from trainer.configs import UsageError
 
 SPACES = sorted(path.name for path in (configs.folder() / configs.SEARCH).glob("*.yaml"))
@@ -113,3 +118,80 @@ def test_wrong_space_is_refused_with_the_key(tmp_path, text, said):
 def test_spaces_are_no_configurations():
     assert SPACES
     assert not [name for name in configs.names() if name.startswith(configs.SEARCH)]
+
+
+def test_negative_values_with_an_exponent_are_values_and_no_options(tmp_path):
+    assert options({"b": -1e-05, "a": "x"}) == ["--a=x", "--b=-1e-05"]
+    path = tmp_path / "space.yaml"
+    path.write_text("model.optimizer.init_args.lr: {uniform: [-0.00001, 0.1]}")
+    check_space(read_space(path), ["--config", "wskp_bmfr.yaml"], path)
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """Folder of a search that was begun in another folder than this."""
+    training = Training(("--config", "{0}"), ("",), "runs", "exp", "sqlite:///x.db")
+    space = {"a": Range("choice", (1, 2))}
+    search = Search(training, space, 5, Group(2), "val/psnr", "max", 4, 1, 3, 7, 0, str(tmp_path / "work"))
+    search.save(tmp_path)
+    assert Search.load(tmp_path) == search
+    return tmp_path
+
+
+def resumed(folder, *words):
+    parser = argparse.ArgumentParser()
+    tune.add_arguments(parser)
+    args, args.rest = parser.parse_known_args(["--resume", str(folder), *words])
+    return tune._resumed(args, folder)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--workers", "1"], "--workers 1: .* begun with 2"),
+        (["--max-failures", "0"], "--max-failures 0: .* begun with 3"),
+        (["--no-early-stop"], "--no-early-stop: .* begun without"),
+        (["--search-seed", "8"], "--search-seed 8: .* begun with 7"),
+        (["--space", "wskp_bmfr.yaml"], "--space"),
+        (["--trainer.max_epochs", "9"], "--trainer.max_epochs"),
+    ],
+)
+def test_search_that_is_resumed_refuses_what_it_was_not_begun_with(begun, words, said):
+    with pytest.raises(UsageError, match=said):
+        resumed(begun, *words)
+
+
+def test_search_that_is_resumed_takes_what_it_was_begun_with(begun):
+    search = resumed(begun, "--workers", "2", "--trials", "5", "--concurrent", "1")
+    assert (search.concurrent, search.folder) == (1, str(begun / "work"))
+
+
+class Nodes:
+    """A cluster of two nodes with two processors and one GPU each."""
+
+    def nodes(self):
+        return [{"Alive": True, "Resources": {"CPU": 2.0, "GPU": 1.0}}] * 2 + [{"Alive": False}]
+
+
+def test_job_that_this_machine_has_no_room_for_is_refused_with_the_numbers():
+    _check_room(Nodes(), Cluster(None, 2, 2, 1))
+    _check_room(Nodes(), Cluster(None, 9, 2, 1, together=False))
+    with pytest.raises(ValueError, match=r"needs 3 × 1 GPUs, and this machine has 2"):
+        _check_room(Nodes(), Cluster(None, 3, 1, 1))
+
+
+@pytest.mark.parametrize(("cluster", "said"), [
+    (Cluster("auto", 2, 3), "needs 2 × 3 CPUs, and the cluster has 4, at most 2 on a node; it waits"),
+    (Cluster("auto", 9, 1, together=False), ""),
+])  # fmt: skip
+def test_job_that_waits_for_nodes_of_a_cluster_says_so(cluster, said, capsys):
+    _check_room(Nodes(), cluster)
+    error = capsys.readouterr().err
+    assert said in error
+    assert bool(said) == bool(error)
+
+
+def test_failure_in_the_cluster_is_told_by_what_was_raised():
+    text = "ray::_Head.run() (pid=7)\n  File \"x.py\", line 3\nTypeError: 'int' object\n"
+    assert reason(RuntimeError(text)) == "TypeError: 'int' object"
+    assert reason("its process died") == "its process died"

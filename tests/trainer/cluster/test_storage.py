@@ -12,11 +12,6 @@ from trainer.cluster.storage import fetch_checkpoint, fetch_run, send_run, stora
 from trainer.runs import Launch, RunRecord, begin_launch, find_checkpoint
 
 
-@pytest.fixture(autouse=True)
-def hasty(monkeypatch):
-    monkeypatch.setattr("trainer.cluster.storage.SETTLE_S", 0)
-
-
 def make_run(root, step, launch="one"):
     folder = root / "exp" / "20260101-000000"
     RunRecord("exp", folder.name, "sqlite:///x.db", "id").save(folder)
@@ -112,7 +107,7 @@ def test_packed_run_is_whole_where_it_is_unpacked(tmp_path):
 @pytest.fixture
 def alone(tmp_path, monkeypatch):
     """A group of one rank, of a launch that has begun before."""
-    monkeypatch.setenv("PENUMBRA_LAUNCH", "one")
+    monkeypatch.setenv("PENUMBRA_TRAINING", "one")
     torch.distributed.init_process_group("gloo", f"file://{tmp_path}/group", rank=0, world_size=1)
     yield
     torch.distributed.destroy_process_group()

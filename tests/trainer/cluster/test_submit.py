@@ -1,13 +1,17 @@
 """Trainings on a cluster of two nodes."""
 
 import os
+import random
+import shutil
 import signal
 import time
 
 import pytest
 import torch
 
+from tests.end_to_end.conftest import Workplace
 from trainer.runs import RunRecord
+from trainer.spool.sent import left
 from trainer.tracking import open_client
 
 pytestmark = pytest.mark.slow
@@ -15,7 +19,8 @@ pytestmark = pytest.mark.slow
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "2", "--trainer.limit_train_batches", "6",
     "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "1",
-    "--data.init_args.train_patches", "80",
+    "--data.init_args.train_patches", "80", "--data.init_args.workers", "0",
+    "--trainer.log_every_n_steps", "1",
     "--config", "callbacks.yaml",
 )  # fmt: skip
 CALLBACKS = """
@@ -33,41 +38,55 @@ def weights(place):
     return torch.load(place.runs[0] / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-def equal(one, other):
-    assert one["global_step"] == other["global_step"] == 12
+def histories(place):
+    """Return the steps of all numbers of the one run in the tracking store, which has ended well."""
+    (run,) = place.runs
+    record = RunRecord.load(run)
+    client = open_client(record.tracking_uri)
+    found = client.get_run(record.run_id)
+    assert found.info.status == "FINISHED"
+    assert len(client.search_runs([found.info.experiment_id])) == 1
+    keys = [key for key in found.data.metrics if not key.startswith("system/")]
+    return {key: [metric.step for metric in client.get_metric_history(record.run_id, key)] for key in keys}
+
+
+def equal(place, other):
+    """Check that a training ended as another did: weights to the bit, numbers without gap or duplicate."""
+    one, two = weights(place), weights(other)
+    assert one["global_step"] == two["global_step"] == 12
     for name, tensor in one["state_dict"].items():
-        assert torch.equal(tensor, other["state_dict"][name]), name
+        assert torch.equal(tensor, two["state_dict"][name]), name
+    assert histories(place) == histories(other)
 
 
 @pytest.fixture(scope="session")
-def with_torchrun(tmp_path_factory, cluster_cache):
-    """The final checkpoint of the same training by Lightning's own two processes."""
-    from tests.end_to_end.conftest import Workplace
-
+def undisturbed(tmp_path_factory, cluster_cache):
+    """The same training by Lightning's own two processes."""
     place = Workplace(tmp_path_factory.mktemp("alone"), cluster_cache)
     (place.folder / "callbacks.yaml").write_text(CALLBACKS)
     place.trainer(
         "fit", *OPTIONS, "--trainer.devices", "2", "--trainer.strategy", "ddp", "--trainer.accelerator", "cpu"
     )
-    return weights(place)
+    return place
 
 
-def test_two_nodes_end_with_the_weights_of_two_processes_to_the_bit(submitting, with_torchrun):
+def test_two_nodes_end_with_the_weights_of_two_processes_to_the_bit(submitting, undisturbed):
     place, submit = submitting("two")
     (place.folder / "callbacks.yaml").write_text(CALLBACKS)
     printed = place.trainer(*submit, *OPTIONS, "--storage", str(place.folder / "shared"))
-    equal(weights(place), with_torchrun)
+    equal(place, undisturbed)
     assert "epoch 1: validation PSNR" in printed
     assert "trained 12 steps" in printed
     assert "Traceback" not in printed
-    mirrored = place.folder / "shared" / "wskp_bmfr" / place.runs[0].name / "checkpoints" / "last.ckpt"
-    equal(torch.load(mirrored, weights_only=True), with_torchrun)
+    mirror = place.folder / "shared" / "wskp_bmfr" / place.runs[0].name
+    assert (mirror / "checkpoints" / "last.ckpt").read_bytes() == (
+        place.runs[0] / "checkpoints" / "last.ckpt"
+    ).read_bytes()
+    assert left(mirror) == 0
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(
-    submitting, with_torchrun, rank
-):
+def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(submitting, undisturbed, rank):
     place, submit = submitting(f"killed{rank}")
     (place.folder / "callbacks.yaml").write_text(CALLBACKS)
     process = place.start(*submit, *OPTIONS)
@@ -76,24 +95,32 @@ def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(
     assert process.returncode == 0, output
     assert "its process died" in output
     assert "restarted: the run" in output
-    equal(weights(place), with_torchrun)
-    assert len(place.runs) == 1
-    record = RunRecord.load(place.runs[0])
-    client = open_client(record.tracking_uri)
-    assert client.get_run(record.run_id).info.status == "FINISHED"
-    assert len(client.search_runs([client.get_run(record.run_id).info.experiment_id])) == 1
-    steps = [metric.step for metric in client.get_metric_history(record.run_id, "val/psnr_wskp")]
-    assert steps == sorted(set(steps))
-    assert len(steps) == 2
+    equal(place, undisturbed)
 
 
-def kill_at(place, process, step, rank):
-    """Kill the process of a rank when a checkpoint of at least this step lies on the disk."""
+def test_lost_node_is_replaced_from_the_storage_and_the_run_ends_as_if_nothing_had_happened(
+    submitting, nodes, undisturbed
+):
+    place, submit = submitting("lost")
+    (place.folder / "callbacks.yaml").write_text(CALLBACKS)
+    place.environment["MLFLOW_TRACKING_URI"] = f"sqlite:///{place.folder / 'mlflow.db'}"
+    process = place.start(*submit, *OPTIONS, "--storage", str(place.folder / "shared"))
+    kill_at(place, process, random.choice([2, 4, 6]), 0, "shared")
+    nodes[1]()
+    shutil.rmtree(place.folder / "runs")  # which was on the disk of that node
+    output, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, output
+    assert "was fetched from file://" in output
+    equal(place, undisturbed)
+
+
+def kill_at(place, process, step, rank, root="runs"):
+    """Kill the process of a rank some moment after a checkpoint of at least this step was written."""
     deadline = time.monotonic() + 240
     while process.poll() is None and time.monotonic() < deadline:
-        for run in place.runs:
-            path = run / "checkpoints" / "last.ckpt"
-            if path.is_file() and step <= torch.load(path, weights_only=True)["global_step"] < 12:
+        for path in place.folder.glob(f"{root}/*/*/checkpoints/last.ckpt"):
+            if step <= torch.load(path, weights_only=True)["global_step"] < 12:
+                time.sleep(random.uniform(0, 0.6))
                 os.kill(int((place.folder / f"rank-{rank}.pid").read_text()), signal.SIGKILL)
                 return
         time.sleep(0.02)

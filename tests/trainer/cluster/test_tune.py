@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 OPTIONS = (
     "--config", "wskp_bmfr.yaml", "--trainer.max_epochs", "3", "--trainer.limit_train_batches", "2",
     "--trainer.limit_val_batches", "1", "--data.init_args.batch_size", "1",
-    "--data.init_args.train_patches", "80",
+    "--data.init_args.train_patches", "80", "--data.init_args.workers", "0",
 )  # fmt: skip
 SPACE = """
 model.net.layers: {choice: [2, 3]}

@@ -1,4 +1,7 @@
-"""A Ray cluster of two nodes of one core each on this machine; prints its address, ends with its input."""
+"""A Ray cluster of two nodes of one core each on this machine; prints its address, ends with its input.
+
+For every line of the input it loses a node at once, and another one joins.
+"""
 
 import os
 import sys
@@ -17,7 +20,9 @@ NODE = {
 
 if __name__ == "__main__":
     cluster = Cluster(initialize_head=True, head_node_args=NODE)
-    cluster.add_node(**NODE)
+    node = cluster.add_node(**NODE)
     print(cluster.address, flush=True)
-    sys.stdin.read()
+    for _ in sys.stdin:
+        cluster.remove_node(node, allow_graceful=False)
+        node = cluster.add_node(**NODE)
     cluster.shutdown()

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
-import torch
 
-from models.denoiser import Denoised
-from tests.trainer.serving.running import Gate, Running, exr, limits, picture, wait_until
+from tests.trainer.serving.running import Gate, Running, exr, limits, picture, wait_until, zipped
 from trainer.serving import server as serving
-from trainer.serving.batching import Batcher, Batching
-from trainer.serving.limits import Budget, Over, Refusal, Ticket
-from trainer.serving.readers import Readers
+from trainer.serving.limits import Budget, Over, Ticket
 
 HEAD = b"POST /denoise HTTP/1.1\r\nHost: x\r\nContent-Type: image/x-exr\r\nContent-Length: %d\r\n\r\n"
 
@@ -112,6 +109,78 @@ def test_slow_senders_take_no_more_places_than_there_are(content):
         wait_until(lambda: service.service.sending == 0)
 
 
+def test_all_uploads_together_take_no_more_room_than_there_is(content):
+    with Running(Gate(), limits(disk=len(content) + 100, idle=20.0, read=20.0)) as service:
+        with service.raw(HEAD % len(content), content[:200]):
+            wait_until(lambda: service.service.room.taken == 200)
+            for body in (content, iter([content])):  # the second one announces no length
+                refused = service.post(body)
+                assert refused.status_code == 503
+                assert "no room" in refused.json()["detail"]
+                assert int(refused.headers["retry-after"]) >= 1
+        wait_until(lambda: service.service.room.taken == 0)
+        assert service.client.get("/health").status_code == 200
+
+
+def test_what_a_zip_file_unpacks_to_and_results_take_room(content):
+    gate = Gate()
+    gate.opened.set()
+    body = zipped({"f1.exr": content, "f2.exr": content})
+    largest = int(2.5 * len(body))  # the file and what it unpacks to, but no results
+    for disk, status in ((largest - len(body), 413), (largest, 413), (10_000_000, 200)):
+        with Running(gate, limits(disk=disk)) as service:
+            calls = gate.calls
+            answer = service.post(body, {"Content-Type": "application/zip"})
+            assert answer.status_code == status, answer.text
+            assert (gate.calls > calls) == (disk >= largest)
+            wait_until(lambda service=service: service.service.room.taken == 0)
+
+
+def full_disk(*args, **options):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def full_disk_by_openexr(*args, **options):
+    try:
+        raise RuntimeError("Failed to write pixel data to image file. No space left on device.")
+    except RuntimeError as error:
+        raise OSError("f.exr: cannot write the file") from error
+
+
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [("trainer.serving.upload._Raw.write", full_disk), ("trainer.serving.work.write_frame", full_disk),
+     ("trainer.serving.work.write_frame", full_disk_by_openexr)],
+)  # fmt: skip
+def test_a_full_disk_is_the_servers_fault_and_passes(content, monkeypatch, place, error):
+    gate = Gate()
+    gate.opened.set()
+    with Running(gate) as service:
+        with monkeypatch.context() as patch:
+            patch.setattr(place, error)
+            refused = service.post(content)
+        assert (refused.status_code, int(refused.headers["retry-after"])) == (503, 5)
+        assert "no room" in refused.json()["detail"]
+        assert service.post(content).status_code == 200
+        wait_until(lambda: service.service.room.taken == 0)
+
+
+def test_probes_are_answered_though_there_are_too_many_connections(content, monkeypatch):
+    monkeypatch.setattr(serving, "_MORE_CONNECTIONS", 0)
+    monkeypatch.setattr(serving, "_SPARE", 4)
+    with ExitStack() as stack:
+        service = stack.enter_context(Running(Gate(), limits(queue=0), most=1))  # eight connections
+        open_ones = service.server.server_state.connections
+        for _ in range(30):
+            stack.enter_context(service.raw(b"POST /denoise HTTP/1.1\r\nHost: x\r\n"))
+        wait_until(lambda: len(open_ones) == 12)
+        assert service.client.get("/health").json()["status"] == "ok"
+        refused = service.post(content)
+        assert (refused.status_code, refused.headers["connection"]) == (503, "close")
+        assert "too many connections" in refused.json()["detail"]
+        assert len(open_ones) <= 12
+
+
 def test_connections_without_a_request_are_closed(monkeypatch):
     monkeypatch.setattr(serving, "_LOOK", 0.05)
     monkeypatch.setattr(serving, "HEADER_SECONDS", 0.3)
@@ -167,208 +236,27 @@ def _refused(service):
     return False
 
 
-def tiled_bomb(path: Path) -> bytes:
-    """Return a file of a few kilobytes whose tiles are as large as a header can say."""
-    pixels = {f"color.{c}": np.ones((40, 48), np.float32) for c in "RGB"}
-    header = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
-    with OpenEXR.File(header, pixels) as file:
-        file.write(str(path))
-    content = bytearray(path.read_bytes())
-    place = content.index(b"tiles\0tiledesc\0") + len(b"tiles\0tiledesc\0") + 4
-    content[place : place + 8] = (1 << 14).to_bytes(4, "little") * 2
-    return bytes(content)
-
-
-def test_a_file_that_makes_the_decoder_take_all_memory_is_refused_within_bounds(tmp_path):
-    with Running(Gate()) as service:
-        answer = service.post(tiled_bomb(tmp_path / "bomb.exr"))
-        assert answer.status_code == 422
-        peaks = [_peak(process._process.pid) for process in service.service.readers._all]
-    assert max(peaks) < 450 << 20  # with 64 MB of libraries, and 256 MB of scratch
-
-
-def _peak(pid: int) -> int:
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0]) << 10
-
-
-def test_a_reader_that_dies_costs_one_request(tmp_path):
-    exr(tmp_path)
-    readers = Readers(1, limits())
-    ticket = Ticket(time.monotonic() + 60)
-    try:
-        assert readers.frames(tmp_path, "f0.exr", ticket)[0]["name"] == "f0.exr"
-        next(iter(readers._all))._process.kill()
-        with pytest.raises(Refusal, match="made the reader"):
-            readers.frames(tmp_path, "f0.exr", ticket)
-        frame, _ = readers.read(tmp_path, "f0.exr", {}, ticket)
-        assert frame.buffers["color"].shape == (24, 40, 3)
-        assert readers.deaths == 1
-    finally:
-        readers.close()
-
-
-def test_a_reader_that_hangs_is_replaced(tmp_path):
-    import os
-    import signal
-
-    exr(tmp_path)
-    readers = Readers(1, limits(decode=0.3))
-    ticket = Ticket(time.monotonic() + 60)
-    try:
-        os.kill(next(iter(readers._all))._process.pid, signal.SIGSTOP)
-        with pytest.raises(Refusal, match="could not be decoded within"):
-            readers.frames(tmp_path, "f0.exr", ticket)
-        assert readers.deaths == 1
-    finally:
-        readers.close()
-
-
 def test_the_budget_lets_one_wait_until_another_is_done_or_its_time_is_up():
     budget = Budget(100)
     ticket, late = Ticket(time.monotonic() + 60), budget.hold(1, Ticket(time.monotonic() + 0.2))
     with budget.hold(70, ticket), budget.hold(30, ticket), pytest.raises(Over):
         late.__enter__()
-    with budget.hold(10**9, Ticket(time.monotonic() + 60)):
-        assert budget.held == 100
     assert budget.held == 0
 
 
-def test_a_tile_that_fails_does_not_fail_those_in_its_batch():
-    calls = []
+def test_a_service_whose_model_cannot_run_any_more_says_so_at_once(content, monkeypatch, caplog):
+    gate = Gate()
+    gate.opened.set()
+    with Running(gate) as service:
 
-    def call(buffers):
-        calls.append(len(buffers["color"]))
-        if (buffers["color"] < 0).any():
-            raise ValueError("negative")
-        return Denoised(buffers["color"] + 1)
+        def broken(tiles, megapixels):
+            raise RuntimeError("a bug")
 
-    entered, gate = threading.Event(), threading.Event()
-
-    def first(buffers):
-        entered.set()
-        gate.wait(60)
-        return Denoised(buffers["color"])
-
-    batcher = Batcher(Batching(threads=1))
-    ticket = Ticket(time.monotonic() + 60)
-    with ThreadPoolExecutor(4) as pool:
-        held = pool.submit(batcher.run, ticket, first, {"color": torch.zeros(1, 3, 16, 16)})
-        assert entered.wait(60)
-        values = [torch.full((1, 3, 16, 16), float(v)) for v in (1, -1, 2)]
-        waiting = [pool.submit(batcher.run, ticket, call, {"color": value}) for value in values]
-        wait_until(lambda: len(batcher._waiting) == 3)
-        gate.set()
-        held.result()
-        assert waiting[0].result().color.max() == 2
-        with pytest.raises(ValueError, match="negative"):
-            waiting[1].result()
-        assert waiting[2].result().color.max() == 3
-    batcher.close()
-    assert calls == [3, 1, 1, 1]
-
-
-def test_tiles_of_other_shapes_or_beyond_the_memory_are_batches_of_their_own():
-    sizes = []
-    entered, gate = threading.Event(), threading.Event()
-
-    class Net:
-        bytes_per_pixel = 100
-
-        def __call__(self, buffers):
-            sizes.append(tuple(buffers["color"].shape))
-            entered.set()
-            gate.wait(60)
-            return Denoised(buffers["color"])
-
-    net = Net()
-    batcher = Batcher(Batching(most=8, memory=100 * 16 * 16 * 2, threads=1))
-    ticket = Ticket(time.monotonic() + 60)
-    with ThreadPoolExecutor(6) as pool:
-        pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, 8, 8)})
-        assert entered.wait(60)
-        for size in (16, 16, 16, 20):
-            pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, size, size)})
-        wait_until(lambda: len(batcher._waiting) == 4)
-        gate.set()
-    batcher.close()
-    assert sorted(sizes[1:]) == [(1, 3, 16, 16), (1, 3, 20, 20), (2, 3, 16, 16)]
-
-
-def test_a_tile_is_taken_from_behind_others_of_another_shape():
-    sizes = []
-    entered, gate = threading.Event(), threading.Event()
-
-    def net(buffers):
-        sizes.append(tuple(buffers["color"].shape))
-        entered.set()
-        gate.wait(60)
-        return Denoised(buffers["color"])
-
-    batcher = Batcher(Batching(threads=1))
-    ticket, gone = Ticket(time.monotonic() + 60), Ticket(time.monotonic() + 60)
-    with ThreadPoolExecutor(8) as pool:
-        pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, 8, 8)})
-        assert entered.wait(60)
-        for number, size in enumerate((16, 20, 16, 20), 1):
-            pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, size, size)})
-            wait_until(lambda number=number: len(batcher._waiting) == number)
-        dropped = pool.submit(batcher.run, gone, net, {"color": torch.zeros(1, 3, 16, 16)})
-        wait_until(lambda: len(batcher._waiting) == 5)
-        gone.cancel()
-        gate.set()
-        with pytest.raises(Over):
-            dropped.result()
-    assert batcher.alive
-    batcher.close()
-    assert sizes[1:] == [(2, 3, 16, 16), (2, 3, 20, 20)]
-
-
-def test_a_service_whose_model_cannot_run_any_more_is_not_healthy():
-    with Running(Gate()) as service:
-        service.service.batcher.close()
+        monkeypatch.setattr(service.service.batcher, "told", broken)
+        for _ in range(2):  # the one whose tile it was, and one that comes later
+            failed = service.post(content)
+            assert failed.status_code == 503
+            assert "cannot run its model" in failed.json()["detail"]
         answer = service.client.get("/health")
         assert (answer.status_code, answer.json()["status"]) == (503, "failed")
-
-
-def test_large_tiles_are_not_joined_where_that_gains_nothing():
-    sizes = []
-    entered, gate = threading.Event(), threading.Event()
-
-    def net(buffers):
-        sizes.append(len(buffers["color"]))
-        entered.set()
-        gate.wait(60)
-        return Denoised(buffers["color"])
-
-    batcher = Batcher(Batching(most=8, pixels=3 * 16 * 16, threads=1))
-    ticket = Ticket(time.monotonic() + 60)
-    with ThreadPoolExecutor(8) as pool:
-        pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, 8, 8)})
-        assert entered.wait(60)
-        for size in (16, 16, 16, 16, 32, 32):
-            pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, size, size)})
-        wait_until(lambda: len(batcher._waiting) == 6)
-        gate.set()
-    batcher.close()
-    assert sorted(sizes[1:]) == [1, 1, 1, 3]
-
-
-def test_steps_of_a_classical_method_stop_when_nobody_waits():
-    from models.pace import tick
-
-    steps = []
-    ticket = Ticket(time.monotonic() + 60)
-
-    def call(buffers):
-        for step in range(100):
-            steps.append(step)
-            if step == 3:
-                ticket.cancel()
-            tick(0.01)
-
-    batcher = Batcher(Batching(threads=1))
-    with pytest.raises(Over):
-        batcher.run(ticket, call, {"color": torch.zeros(1, 3, 8, 8)})
-    batcher.close()
-    assert steps == [0, 1, 2, 3]
+    assert "a bug" in caplog.text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import stat
+import struct
 import zipfile
 
 import numpy as np
@@ -160,6 +161,19 @@ def encrypted() -> bytes:
     return bytes(content)
 
 
+def outside() -> bytes:
+    """Return a ZIP file whose only member lies far behind the end of the file."""
+    content = member("a.exr")
+    start, end = content.index(b"PK\x01\x02"), content.index(b"PK\x05\x06")
+    place = struct.pack("<HHQ", 1, 8, 2**62)
+    directory = bytearray(content[start:end] + place)
+    directory[30:32] = struct.pack("<H", len(place))
+    directory[42:46] = b"\xff" * 4
+    last = bytearray(content[end:])
+    last[12:16] = struct.pack("<I", len(directory))
+    return content[:start] + bytes(directory) + bytes(last)
+
+
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
@@ -170,6 +184,8 @@ def encrypted() -> bytes:
         (member("a.exr", external_attr=(stat.S_IFLNK | 0o777) << 16), "no plain file"),
         (encrypted(), "encrypted"),
         (member("a.txt"), "nothing but EXR"),
+        (member("a.exr").replace(b"a.exr", b"\0.exr"), "nothing but EXR"),
+        (outside(), "damaged ZIP file"),
         (member("a.zip", zipped({"a.exr": b"x"})), "nothing but EXR"),
         (member("a.exr", zipped({"a.exr": b"x"})), "not an OpenEXR file"),
         (zipped({"a/f.exr": b"x", "b/f.exr": b"y"}), "twice"),

@@ -17,6 +17,7 @@ from tests.trainer.serving.running import Running, limits, picture, small_wskp, 
 from tests.trainer.serving.test_answers import denoised
 from tests.trainer.test_denoise import frame as moving
 from tests.trainer.test_denoise_sequences import Smear
+from trainer.serving.limits import CHANNELS
 
 COUNT = 5
 ZIP = {"Content-Type": "application/zip"}
@@ -36,7 +37,7 @@ def served(model: Denoiser, clip: Path) -> dict[str, np.ndarray]:
     body = zipped({path.name: path.read_bytes() for path in clip.iterdir()})
     with Running(model, limits()) as service:
         answer = service.post(body, ZIP)
-    assert answer.status_code == 200, answer.text
+        assert answer.status_code == 200, answer.text
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         return {name: picture(archive.read(name), clip.parent) for name in archive.namelist()}
 
@@ -58,6 +59,17 @@ def test_frames_of_a_sequence_are_accumulated_as_the_command_does(clip, tmp_path
     assert list(found) == [f"f{i}.exr" for i in range(COUNT)]
     for name, image in found.items():
         np.testing.assert_array_equal(image, expected[name])
+
+
+def test_frames_that_are_held_together_may_not_take_more_than_one_large_frame(clip):
+    shown = read_frame(clip / "f0.exr")
+    channels = sum(array.shape[-1] for array in shown.buffers.values())
+    assert channels < CHANNELS < 3 * channels
+    body = zipped({path.name: path.read_bytes() for path in clip.iterdir()})
+    with Running(Smear(), limits(megapixels=1.01e-6 * shown.height * shown.width)) as service:
+        refused = service.post(body, ZIP)
+    assert refused.status_code == 422
+    assert "frames at a time" in refused.json()["detail"]
 
 
 def test_a_space_time_method_sees_all_frames(clip):

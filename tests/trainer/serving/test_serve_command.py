@@ -12,16 +12,20 @@ from trainer import cli
 from trainer.commands import serve as command
 
 
-def run(*arguments: str) -> int:
+def parsed(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="trainer serve")
     command.add_arguments(parser)
-    return command.run(parser.parse_args(["--model", "JointBilateral", *arguments]))
+    return parser.parse_args(["--model", "JointBilateral", *arguments])
+
+
+def run(*arguments: str) -> int:
+    return command.run(parsed(*arguments))
 
 
 @pytest.mark.parametrize(
     ("option", "value"),
     [("--port", "70000"), ("--port", "x"), ("--max-megapixels", "0"), ("--timeout", "nan"), ("--batch", "0"),
-     ("--tile", "8"), ("--memory", "much"), ("--queue", "-1")],
+     ("--tile", "8"), ("--memory", "much"), ("--queue", "-1"), ("--disk", "0")],
 )  # fmt: skip
 def test_wrong_numbers_are_wrong_usage(option, value, capsys):
     with pytest.raises(SystemExit) as ended:

@@ -1,9 +1,11 @@
-"""Progress of a preparation: rate and remaining time, as plain lines."""
+"""Progress of work that is counted: rate and remaining time, as plain lines."""
 
 from __future__ import annotations
 
 import sys
 import time
+
+from data.alive import touch
 
 
 def duration(seconds: float) -> str:
@@ -63,6 +65,7 @@ class LineProgress:
 
     def __call__(self, done: int, total: int) -> None:
         """Report that `done` of `total` samples are finished."""
+        touch()
         text = self._rate.text(done, total)
         now = time.monotonic()
         if self._last is None or now - self._last >= self.interval or done == total:
