@@ -5,8 +5,8 @@ Alternating Images*, 2020 (doi:10.1145/3406183), and Andersson, Nilsson, Shirley
 Errors in Rendered High Dynamic Range Images*, 2021 (doi:10.2312/egs.20211015). Equation numbers are those of
 the first.
 
-Two things differ from a literal reading, neither changes a value: the filters are sums of products of two
-one-dimensional ones and are applied as such, and pixels are worked on in float32 as in the authors' program.
+Filters are sums of products of two one-dimensional ones and are applied as such; pixels are worked on in
+float32, as in the authors' program.
 """
 
 from __future__ import annotations
@@ -161,10 +161,8 @@ def _rgb(opponent: Tensor) -> Tensor:
 def _perceived(opponent: Tensor, ppd: float) -> Tensor:
     """Return what remains after the eye's blur in CIELAB with Hunt's adjustment (equations 5 to 13)."""
     radius = math.ceil(3 * math.sqrt(max(max(g.b) for g in _SENSITIVITY) / (2 * math.pi**2)) * ppd)
-    blurred = [
-        _blurred(opponent[:, i : i + 1], gaussians, radius, ppd) for i, gaussians in enumerate(_SENSITIVITY)
-    ]
-    return _hunt(_rgb(torch.cat(blurred, 1)).clamp(0, 1))
+    blurred = [_blurred(opponent[:, i], gaussians, radius, ppd) for i, gaussians in enumerate(_SENSITIVITY)]
+    return _hunt(_rgb(torch.stack(blurred, 1)).clamp(0, 1))
 
 
 def _blurred(channel: Tensor, gaussians: _Gaussians, radius: int, ppd: float) -> Tensor:
@@ -173,17 +171,25 @@ def _blurred(channel: Tensor, gaussians: _Gaussians, radius: int, ppd: float) ->
     weights = [a * math.sqrt(math.pi / b) for a, b in zip(gaussians.a, gaussians.b, strict=True)]
     total = sum(weight * float(line.sum()) ** 2 for weight, line in zip(weights, lines, strict=True))
     parts = [
-        weight / total * _separable(channel, line, line) for weight, line in zip(weights, lines, strict=True)
+        _filtered(_filtered(channel, line, -1), weight / total * line, -2)
+        for weight, line in zip(weights, lines, strict=True)
     ]
-    return torch.stack(parts).sum(0)
+    return parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
 
 
-def _separable(channel: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """Return a channel (B, 1, H, W) filtered along rows, then along columns; borders are repeated."""
-    radius = len(across) // 2
-    across, down = across.to(channel), down.to(channel)
-    rows = F.conv2d(F.pad(channel, (radius, radius, 0, 0), mode="replicate"), across.view(1, 1, 1, -1))
-    return F.conv2d(F.pad(rows, (0, 0, radius, radius), mode="replicate"), down.view(1, 1, -1, 1))
+def _filtered(image: Tensor, line: Tensor, axis: int) -> Tensor:
+    """Return an image (B, H, W) filtered along rows (-1) or columns (-2); borders are repeated.
+
+    Sums of shifted images: a convolution of one channel with one line is three times slower.
+    """
+    radius, size = len(line) // 2, image.shape[axis]
+    around = (radius, radius, 0, 0) if axis == -1 else (0, 0, radius, radius)
+    padded = F.pad(image, around, mode="replicate")
+    total = padded.narrow(axis, 0, size) * float(line[0])
+    for place, weight in enumerate(line.tolist()[1:], 1):
+        if weight:
+            total.add_(padded.narrow(axis, place, size), alpha=weight)
+    return total
 
 
 def _hunt(rgb: Tensor) -> Tensor:
@@ -225,15 +231,19 @@ def _feature_error(one: Tensor, other: Tensor, ppd: float) -> Tensor:
     radius = math.ceil(3 * sigma)
     place = torch.arange(-radius, radius + 1, dtype=torch.float64)
     bell = torch.exp(-torch.square(place / sigma) / 2)
-    differences = []
-    for detector in (-place * bell, (torch.square(place / sigma) - 1) * bell):
-        detector = torch.where(
-            detector > 0, detector / detector.clamp_min(0).sum(), -detector / detector.clamp_max(0).sum()
+    detectors = [-place * bell, (torch.square(place / sigma) - 1) * bell]
+    detectors = [
+        torch.where(line > 0, line / line.clamp_min(0).sum(), -line / line.clamp_max(0).sum())
+        for line in detectors
+    ]
+    lengths = []
+    for image in (one, other):
+        smooth = [_filtered(image, bell / bell.sum(), axis) for axis in (-2, -1)]
+        lengths.append(
+            [
+                torch.hypot(_filtered(smooth[0], line, -1), _filtered(smooth[1], line, -2))
+                for line in detectors
+            ]
         )
-        lengths = []
-        for image in (one, other):
-            pair = [(detector, bell / bell.sum()), (bell / bell.sum(), detector)]
-            across, down = (_separable(image[:, None], *filters)[:, 0] for filters in pair)
-            lengths.append(torch.hypot(across, down))
-        differences.append((lengths[0] - lengths[1]).abs())
+    differences = [(first - second).abs() for first, second in zip(*lengths, strict=True)]
     return (torch.maximum(*differences) / math.sqrt(2)).pow(_FEATURE_POWER).clamp(0, 1)

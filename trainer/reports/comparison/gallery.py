@@ -24,7 +24,7 @@ from trainer.reports.comparison.coding import bits_of, encode, to_text
 from trainer.reports.comparison.levels import Array, Scale, to_planes
 from trainer.reports.comparison.maps import block_means, flip_map
 
-BUDGET = 57_000_000
+BUDGET = 55_000_000
 """Bytes of all pictures together, as text; scripts, tables and names come beside them."""
 
 
@@ -43,7 +43,7 @@ QUALITIES = (
 NOISE = 2.0
 """How much coarser than the others the noisy input is stored: its pixels are off by more than that anyway."""
 
-_PILOTS, _SIDE = 8, 256
+_PILOTS, _SIDE = 3, 320
 _MOST = (48.0, 7.0)
 """More bits than a pixel of a picture and of a FLIP map take at the finest bound."""
 _LETTER = 8 * 2 / 13  # letters per byte
@@ -77,6 +77,11 @@ class Picture:
     path: Path
     target: Path | None
     scale: Scale
+
+    @property
+    def column(self) -> str:
+        """Number of its column."""
+        return self.key.partition("-")[2]
 
 
 @dataclass(frozen=True)
@@ -150,7 +155,7 @@ def gallery_of(
     if not order:
         return Gallery((), QUALITIES[0], ())
     everything = [picture for i in order for picture in pictures[i]]
-    most = {p.scale.bound: _MOST[0] for p in everything} | {0.0: _MOST[1]}
+    most = {str(c): sum(_MOST) for c in range(len(columns))}
     fits = sum(_sizes(everything, most, frames)) < budget
     density, chosen = [most] * len(QUALITIES) if fits else _densities(everything), 0
     while chosen < len(QUALITIES) - 1 and sum(_sizes(everything, density[chosen], frames)) > budget:
@@ -217,45 +222,38 @@ def _turn(place: int, count: int) -> float:
         turn += 1
 
 
-def _densities(pictures: Sequence[Picture]) -> list[dict[float, float]]:
-    """Return for each quality how many bits a pixel takes, by looseness; 0 is that of FLIP maps."""
+def _densities(pictures: Sequence[Picture]) -> list[dict[str, float]]:
+    """Return for each quality how many bits a pixel of each column takes, its FLIP map included."""
     chosen: list[Picture] = []
-    for looseness in {p.scale.bound for p in pictures}:
-        kind = [p for p in pictures if p.scale.bound == looseness]
+    for column in dict.fromkeys(p.column for p in pictures):
+        kind = [p for p in pictures if p.column == column]
         chosen += [kind[i] for i in np.linspace(0, len(kind) - 1, min(_PILOTS, len(kind))).astype(int)]
-    samples: list[dict[float, list[float]]] = [{} for _ in QUALITIES]
+    samples: list[dict[str, list[float]]] = [{} for _ in QUALITIES]
     with _single_threaded():
         for picture in chosen:
             _measure(picture, samples)
     return [{key: float(np.mean(values)) for key, values in found.items()} for found in samples]
 
 
-def _measure(picture: Picture, samples: list[dict[float, list[float]]]) -> None:
+def _measure(picture: Picture, samples: list[dict[str, list[float]]]) -> None:
     """Add the bits that a pixel in the middle of a picture takes, for each quality."""
-    crop = _middle(_read(picture.path))
-    for quality, found in zip(QUALITIES, samples, strict=True):
-        bits = bits_of(to_planes(crop, _bounded(picture, quality.bound).scale)) / crop[..., 0].size
-        found.setdefault(picture.scale.bound, []).append(bits)
-    if picture.target is None:
-        return
-    other = _middle(_read(picture.target))
-    if other.shape == crop.shape:
+    crop, maps = _middle(_read(picture.path)), {}
+    other = crop if picture.target is None else _middle(_read(picture.target))
+    if picture.target is not None and other.shape == crop.shape:
         flip = flip_map(crop, other, picture.scale.exposure)
-        bits_by = {
-            block: bits_of([block_means(flip, block)]) / flip.size for block in {q.block for q in QUALITIES}
-        }
-        for quality, found in zip(QUALITIES, samples, strict=True):
-            found.setdefault(0.0, []).append(bits_by[quality.block])
+        maps = {block: bits_of([block_means(flip, block)]) for block in {q.block for q in QUALITIES}}
+    for quality, found in zip(QUALITIES, samples, strict=True):
+        bits = bits_of(to_planes(crop, _bounded(picture, quality.bound).scale)) + maps.get(quality.block, 0)
+        found.setdefault(picture.column, []).append(bits / crop[..., 0].size)
 
 
 def _sizes(
-    pictures: Sequence[Picture], density: dict[float, float], frames: Sequence[dict[str, Any]]
+    pictures: Sequence[Picture], density: dict[str, float], frames: Sequence[dict[str, Any]]
 ) -> Iterator[float]:
     """Yield the bytes that each picture will take on the page, with its FLIP map."""
     for picture in pictures:
         frame = frames[int(picture.key.partition("-")[0])]
-        bits = density.get(picture.scale.bound, 0.0)
-        bits += density.get(0.0, 0.0) if picture.target is not None else 0.0
+        bits = density[picture.column]
         # Tables, states and the borders of pilots are the rest.
         yield (frame["width"] * frame["height"] * bits / 8 * 1.02 + 6000) * _LETTER
 
