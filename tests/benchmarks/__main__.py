@@ -27,6 +27,7 @@ MODULES = (
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
     *("nfor", "nfor_growth", "nlm", "classical_quality", "flicker"),
     *("scaling", "remote", "outage", "serve"),
+    "evaluation",
 )
 RESULTS = Path("bench") / "results.json"
 

@@ -126,7 +126,7 @@ function digits(value, count = 4) {
   if (value !== value) return "NaN";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  const text = size >= 1e5 || size < 1e-4 ? value.toExponential(count - 2) : String(+value.toPrecision(count));
+  const text = size >= 1e5 || size < 1e-4 ? value.toExponential(Math.max(0, count - 2)) : String(+value.toPrecision(count));
   return text.replace("-", "−");
 }
 
