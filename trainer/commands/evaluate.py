@@ -14,8 +14,8 @@ from trainer.options import AddModel, AddOption
 if TYPE_CHECKING:
     import pandas as pd
 
-    from trainer.evaluation.plan import Method
-    from trainer.evaluation.running import Outcome, Setting
+    from trainer.evaluation.plan import Method, Setting
+    from trainer.evaluation.running import Outcome
     from trainer.evaluation.tables import Scored, Table
 
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
@@ -70,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--jobs", type=int, default=1, metavar="N", help="processes that take metrics meanwhile (default: 1)"
     )
     parser.add_argument(
-        "--no-costs", action="store_true", help="do not measure time and memory of the methods"
+        "--no-costs",
+        action="store_true",
+        help="do not measure time and memory of the methods (never done on a cluster)",
     )
     parser.add_argument("--no-track", action="store_true", help="do not record the evaluation in MLflow")
     parser.add_argument(
@@ -93,6 +95,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check(args: argparse.Namespace) -> None:
+    """Check the options alone; nothing is read.
+
+    Raises:
+        UsageError: Some do not fit.
+    """
+    from trainer.configs import UsageError
+    from trainer.evaluation.plan import methods_of
+
+    _metrics(args.metrics)
+    try:
+        methods_of(args.models)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 def run(args: argparse.Namespace) -> int:
     """Evaluate; returns the exit code.
 
@@ -101,12 +119,13 @@ def run(args: argparse.Namespace) -> int:
         ValueError: There is nothing to evaluate, or the folder holds something else.
         OSError: A file cannot be read or written.
     """
+    from data.jobs import elsewhere
     from trainer.commands.denoise import check_device
     from trainer.evaluation.champion import champions_beside
     from trainer.evaluation.costs import cost_table, costs_of
-    from trainer.evaluation.plan import clips_of, methods_of
+    from trainer.evaluation.plan import Setting, clips_of, methods_of
     from trainer.evaluation.record import rows_of, write_record, write_rows, write_tables
-    from trainer.evaluation.running import Evaluation, Setting
+    from trainer.evaluation.running import Evaluation
     from trainer.evaluation.tables import Scored
     from trainer.loading import model_store
     from trainer.outputs import make_folder
@@ -137,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
     write_rows(rows, args.output)
-    costs = {} if args.no_costs else costs_of(outcomes, rows, setting, _say)
+    costs = {} if args.no_costs or elsewhere() else costs_of(outcomes, rows, setting, _say)
     table = cost_table(costs, outcomes)
     tables = write_tables(rows, [o.method.label for o in outcomes], setting, [table] if table else [])
     write_record(outcomes, rows, setting, costs)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 HELP = "run a training, or many independent jobs, on a Ray cluster"
 
 DESCRIPTION = """\
-Runs what `trainer fit`, `render` or `prepare` run, spread over machines:
+Runs what `trainer fit`, `render`, `prepare` or `evaluate` run, spread over machines:
 
   trainer submit --config wskp_bmfr.yaml --workers 8 --gpus-per-worker 1 --address ray://head:10001
   trainer submit render stills --random 100 --output /shared/frames --workers 64 --address auto
@@ -23,7 +23,7 @@ Runs what `trainer fit`, `render` or `prepare` run, spread over machines:
 All other options are those of the command, and are checked before anything starts. Without --address a Ray of
 its own is started on this machine and ended afterwards. The exit status is that of the command.
 """
-VERBS = ("render", "prepare")
+VERBS = ("render", "prepare", "evaluate")
 PASSES_ON = True
 
 
@@ -32,7 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.description = DESCRIPTION
     parser.allow_abbrev = False
-    parser.usage = "trainer submit [fit | render | prepare] [options below] [options of the command]"
+    parser.usage = (
+        "trainer submit [fit | render | prepare | evaluate] [options below] [options of the command]"
+    )
     add_cluster_options(parser)
     parser.add_argument(
         "--storage",

@@ -9,8 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from trainer.evaluation.plan import INPUT
-from trainer.evaluation.running import Outcome, Setting
+from trainer.evaluation.plan import INPUT, Setting
+from trainer.evaluation.running import Outcome
 from trainer.evaluation.tables import Cell, Table, ranked
 from trainer.outputs import replacing
 

@@ -33,6 +33,33 @@ class Method:
     folder: str = ""
 
 
+@dataclass(frozen=True)
+class Setting:
+    """How everything is run.
+
+    Attributes:
+        root: The data set, as the user named it.
+        split: Which part.
+        data: What tells these frames from others: the hash of a manifest, or names.
+        names: Frames in order, and for each that of the preceding one of its sequence.
+        folder: Of the evaluation.
+        metrics: Names of the metrics.
+        device: Where methods run.
+        memory: Bytes that a call of a method may take.
+        jobs: Processes that take scores.
+    """
+
+    root: str
+    split: str | None
+    data: str
+    names: dict[str, str | None]
+    folder: Path
+    metrics: tuple[str, ...]
+    device: str = "cpu"
+    memory: int = 2 * 1024**3
+    jobs: int = 1
+
+
 def methods_of(named: Sequence[tuple[str, Sequence[str]]]) -> list[Method]:
     """Return the methods that models with their options mean, with different names.
 

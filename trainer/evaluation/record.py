@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from trainer.evaluation.plan import INPUT
-from trainer.evaluation.running import Outcome, Setting
+from trainer.evaluation.plan import INPUT, Setting
+from trainer.evaluation.running import Outcome
 from trainer.evaluation.tables import Scored, Table, tables_of
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.metrics.measures import LEFT_OUT, SCORES

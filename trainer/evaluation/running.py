@@ -20,10 +20,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from trainer.evaluation.plan import INPUT, NOISY, Method
-from trainer.evaluation.scores import Question, score
-from trainer.evaluation.worker import Task
+from data.jobs import Runner, elsewhere
+from trainer.evaluation.plan import INPUT, NOISY, Method, Setting
+from trainer.evaluation.scores import question_of, score
+from trainer.evaluation.spreading import Told, spread
+from trainer.evaluation.worker import Task, facts_of
 from trainer.export.description import DISTRIBUTION, installed_version
+from trainer.loading import resolve
 from trainer.progress import FrameProgress
 
 ROWS = "rows.jsonl"
@@ -71,33 +74,6 @@ class Outcome:
         )
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How everything is run.
-
-    Attributes:
-        root: The data set, as the user named it.
-        split: Which part.
-        data: What tells these frames from others: the hash of a manifest, or names.
-        names: Frames in order, and for each that of the preceding one of its sequence.
-        folder: Of the evaluation.
-        metrics: Names of the metrics.
-        device: Where methods run.
-        memory: Bytes that a call of a method may take.
-        jobs: Processes that take scores.
-    """
-
-    root: str
-    split: str | None
-    data: str
-    names: dict[str, str | None]
-    folder: Path
-    metrics: tuple[str, ...]
-    device: str = "cpu"
-    memory: int = 2 * 1024**3
-    jobs: int = 1
-
-
 class Evaluation:
     """Runs methods and scores.
 
@@ -108,7 +84,6 @@ class Evaluation:
 
     def __init__(self, setting: Setting, progress: FrameProgress) -> None:
         self.setting, self.progress = setting, progress
-        self.images = setting.folder / "images"
         self._kept = _Kept(setting.folder / ROWS)
 
     def run(self, methods: Sequence[Method]) -> list[Outcome]:
@@ -119,11 +94,48 @@ class Evaluation:
             KeyboardInterrupt: What was done so far stays.
         """
         noisy = Method(INPUT, NOISY, folder=INPUT)
+        if runner := elsewhere():
+            return self._spread([noisy], runner) + self._spread(methods, runner)
         with ProcessPoolExecutor(self.setting.jobs, get_context("spawn"), initializer=_quiet) as pool:
             found = []
             for method in (noisy, *methods):
                 found.append(self._one(method, pool))
         return found
+
+    def _spread(self, methods: Sequence[Method], runner: Runner) -> list[Outcome]:
+        """Have clips denoised and scored elsewhere, but those that are there."""
+        found = {method.label: Outcome(method) for method in methods}
+        for outcome in found.values():
+            self._prepare(outcome)
+
+        def take(method: Method, told: Told) -> None:
+            outcome = found[method.label]
+            for message in told:
+                outcome.reason = message.get("reason", outcome.reason)
+                if "say" in message:
+                    self.progress.say(f"{method.label}: {message['say']}", message["kind"])
+                if "row" in message:
+                    row = {"method": method.label, "identity": self._identity(outcome), **message["row"]}
+                    outcome.rows[row["name"]] = row
+                    self._kept.add(row)
+                    self.progress.advance(f"{method.label} {row['name']}")
+
+        wanted = {outcome.method: set(outcome.rows) for outcome in found.values() if not outcome.reason}
+        for label, reason in spread(wanted, self.setting, runner, take).items():
+            found[label].crashed, found[label].reason = True, reason
+        return list(found.values())
+
+    def _prepare(self, outcome: Outcome) -> None:
+        """Load a method here to know what it is, and which of its rows are there."""
+        method = outcome.method
+        try:
+            outcome.facts = facts_of(resolve(method.model, options=method.options))
+        except (ValueError, OSError) as error:
+            outcome.reason = (str(error).splitlines() or [repr(error)])[0]
+            return
+        outcome.rows = self._kept.of(method.label, self._identity(outcome))
+        for name in outcome.rows:
+            self.progress.advance(f"{method.label} {name}")
 
     def _one(self, method: Method, pool: ProcessPoolExecutor) -> Outcome:
         outcome = Outcome(method)
@@ -166,14 +178,7 @@ class Evaluation:
 
     def _score(self, row: Row, method: Method, pool: ProcessPoolExecutor) -> None:
         """Have a frame scored; its row is kept when that is done."""
-        question = Question(
-            str(self.images),
-            method.folder,
-            row["name"],
-            self.setting.names[row["name"]],
-            row["exposure"],
-            self.setting.metrics,
-        )
+        question = question_of(self.setting, method, row)
 
         def finished(answer: Future[dict[str, float]]) -> None:
             if answer.cancelled():
@@ -191,11 +196,7 @@ class Evaluation:
     @contextmanager
     def _worker(self, method: Method, outcome: Outcome) -> Iterator[_Worker]:
         """Yield a worker; why it ended, unless it was done, is said in `outcome`."""
-        setting = self.setting
-        task = Task(
-            method.model, method.options, setting.root, setting.split, str(self.images), method.folder,
-            setting.device, setting.memory,
-        )  # fmt: skip
+        setting, task = self.setting, Task.of(method, self.setting)
         path = setting.folder / "logs" / f"{method.folder}.txt"
         path.parent.mkdir(parents=True, exist_ok=True)
         with _Worker(task, path) as worker:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from data.exr_image import read_exr
-from trainer.evaluation.plan import PLACES, REFERENCE
+from trainer.evaluation.plan import PLACES, REFERENCE, Method, Setting
 from trainer.metrics.measures import SCORES
 from trainer.metrics.temporal import change_gamma, flicker_gamma
 
@@ -36,6 +37,19 @@ class Question:
     before: str | None
     exposure: float
     metrics: tuple[str, ...]
+
+
+def question_of(setting: Setting, method: Method, row: Mapping[str, Any]) -> Question:
+    """Return what is scored of a frame that a worker told of."""
+    name = row["name"]
+    return Question(
+        str(setting.folder / "images"),
+        method.folder,
+        name,
+        setting.names[name],
+        row["exposure"],
+        setting.metrics,
+    )
 
 
 def score(question: Question) -> dict[str, float]:

@@ -22,7 +22,7 @@ from data.exr_image import write_exr
 from data.frame import Frame, Image
 from trainer.clips import Clip, Item
 from trainer.denoising import ClipDenoiser, Result, Settings
-from trainer.evaluation.plan import INPUT, PLACES, REFERENCE, clips_of
+from trainer.evaluation.plan import INPUT, PLACES, REFERENCE, Method, Setting, clips_of
 from trainer.loading import Loaded, resolve
 from trainer.outputs import replacing
 
@@ -41,6 +41,7 @@ class Task:
         device: Where it runs.
         memory: Bytes that it may take for a call.
         threads: Of PyTorch; 0: its own choice.
+        only: Names of the frames that are wanted; empty: all.
     """
 
     model: str
@@ -52,6 +53,15 @@ class Task:
     device: str = "cpu"
     memory: int = 2 * 1024**3
     threads: int = 0
+    only: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(method: Method, setting: Setting) -> Task:
+        """Return what a worker does for a method."""
+        return Task(
+            method.model, method.options, setting.root, setting.split, str(setting.folder / "images"),
+            method.folder, setting.device, setting.memory,
+        )  # fmt: skip
 
 
 class Worker:
@@ -95,8 +105,9 @@ class Worker:
         there = set(json.loads(self.heard.readline() or "[]"))
         clips, _ = clips_of(self.task.root, self.task.split or "all")
         for clip in clips:
-            for part in parts(clip, loaded):
-                if any(item.name not in there for item in part.items):
+            for part in parts(clip):
+                wanted = [item.name for item in part.items if item.name in (self.task.only or (item.name,))]
+                if any(name not in there for name in wanted):
                     self.clip(loaded, part)
 
     def clip(self, loaded: Loaded, clip: Clip) -> None:
@@ -177,7 +188,7 @@ class Worker:
             np.savez_compressed(temporary, places=places)
 
 
-def parts(clip: Clip, loaded: Loaded) -> list[Clip]:
+def parts(clip: Clip) -> list[Clip]:
     """Return what can be denoised one without the other: single frames where they are independent views."""
     if clip.sequence:
         return [clip]
@@ -218,7 +229,7 @@ def main() -> int:
     import torch
 
     given: dict[str, Any] = json.loads(sys.stdin.readline())
-    task = Task(**{**given, "options": tuple(given["options"])})
+    task = Task(**{**given, "options": tuple(given["options"]), "only": tuple(given["only"])})
     if task.threads:
         torch.set_num_threads(task.threads)
     worker = Worker(task, sys.stdin, sys.stdout)

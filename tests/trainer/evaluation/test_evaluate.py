@@ -1,6 +1,7 @@
 """`trainer evaluate` on a miniature: what it writes, what it says where parts fail, that it goes on."""
 
 import json
+import pickle
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from data.exr import write_frame
 from data.frame import Frame
+from data.jobs import run_elsewhere
 from models.denoiser import Denoised
 from tests.models.frames import split_buffers
 from trainer.cli import main
@@ -151,6 +153,45 @@ def test_other_metrics_are_taken_anew(monkeypatch, frames, tmp_path):
     assert evaluate(monkeypatch, frames, output, *model, "--metric", "smape_wskp") == 0
     rows = pd.read_parquet(output / "rows.parquet")
     assert rows.loc[rows["reference"], "smape_wskp"].notna().all()
+
+
+class Runner:
+    """Does jobs one after the other, in this process, as if each were on another machine."""
+
+    workers = cores = 1
+
+    def __init__(self, fails=""):
+        self.fails, self.names = fails, []
+
+    def __call__(self, jobs, done):
+        failed = []
+        for job in jobs:
+            function, arguments = pickle.loads(pickle.dumps((job.function, job.arguments)))
+            assert all(path.exists() for path in job.sees)
+            self.names.append(job.name)
+            if self.fails and job.name.startswith(self.fails):
+                failed.append(job.name)
+            else:
+                done(job, function(*arguments))
+        if failed:
+            raise ValueError(f"{len(failed)} jobs failed ({', '.join(failed)}: the node was lost)")
+
+
+def test_jobs_elsewhere_give_the_same_rows(monkeypatch, frames, tmp_path, capsys):
+    models = ("--model", f"half={HERE}.Halved", "--model", f"same={HERE}.Noisy", "--metric", "psnr_wskp")
+    assert evaluate(monkeypatch, frames, tmp_path / "here", *models, "--no-costs") == 0
+    runner = Runner(fails="same")
+    with run_elsewhere(runner):
+        assert evaluate(monkeypatch, frames, tmp_path / "there", *models) == 0
+        assert "node was lost" in capsys.readouterr().err
+        runner.fails, runner.names = "", []
+        assert evaluate(monkeypatch, frames, tmp_path / "there", *models) == 0
+    assert [name.partition(",")[0] for name in runner.names] == ["same"]  # the rest was there
+    here, there = (
+        pd.read_parquet(tmp_path / kind / "rows.parquet").drop(columns="seconds")
+        for kind in ("here", "there")
+    )
+    pd.testing.assert_frame_equal(here, there)
 
 
 @pytest.mark.parametrize(
