@@ -14,9 +14,10 @@ from trainer.options import AddModel, AddOption
 if TYPE_CHECKING:
     import pandas as pd
 
+    from trainer.evaluation.cells import Table
     from trainer.evaluation.plan import Method, Setting
     from trainer.evaluation.running import Outcome
-    from trainer.evaluation.tables import Scored, Table
+    from trainer.evaluation.tables import Scored
 
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from trainer.evaluation.cells import Cell, Table
 from trainer.evaluation.plan import INPUT, Setting
 from trainer.evaluation.running import Outcome
-from trainer.evaluation.tables import Cell, Table, ranked
+from trainer.evaluation.tables import ranked
 from trainer.outputs import replacing
 
 COSTS = "costs.json"

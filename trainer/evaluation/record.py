@@ -10,9 +10,10 @@ from typing import Any
 
 import pandas as pd
 
+from trainer.evaluation.cells import Table
 from trainer.evaluation.plan import INPUT, Setting
 from trainer.evaluation.running import Outcome
-from trainer.evaluation.tables import Scored, Table, tables_of
+from trainer.evaluation.tables import Scored, tables_of
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.metrics.measures import LEFT_OUT, SCORES
 from trainer.outputs import replacing

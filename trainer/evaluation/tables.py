@@ -1,4 +1,4 @@
-"""Tables of an evaluation: means over frames with confidence intervals, ranks, in Markdown, LaTeX and CSV.
+"""Tables of an evaluation: means over frames with confidence intervals, ranks.
 
 The layouts are those of the papers: one row per scene and one column per method (tables 1 and 2 of Fan et
 al. 2021), one per number of samples (table 1 of Yu et al. 2021), one row per method (table 1 of Munkberg and
@@ -7,130 +7,31 @@ Hasselgren 2020).
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy import stats
 
+from trainer.evaluation.cells import Cell, Table
 from trainer.evaluation.plan import INPUT
 from trainer.metrics.measures import SCORES
 
 AVERAGE = "average"
 CONFIDENCE = 0.95
+Places = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A mean over frames.
-
-    Attributes:
-        mean: Of the frames that have a value; NaN where none has.
-        half: Half the width of the confidence interval; NaN for fewer than two frames.
-        count: Frames with a value.
-        missing: Frames with a reference that have none: the method failed there, or returned NaN.
-        rank: 1 for the best of its group; 0 where it takes no part.
-        form: How a value is printed, `{:.2f}`.
-    """
-
-    mean: float
-    half: float = math.nan
-    count: int = 0
-    missing: int = 0
-    rank: int = 0
-    form: str = "{:.4f}"
-
-    def text(self) -> str:
-        """Return the mean, with what is missing: `24.31`, `24.31 (2 missing)`, `-`."""
-        if not self.count or math.isnan(self.mean):
-            return "-" if not self.missing else f"- ({self.missing} missing)"
-        text = self.form.format(self.mean)
-        return f"{text} ({self.missing} missing)" if self.missing else text
-
-    def interval(self) -> str:
-        """Return half the interval as printed, empty where there is none."""
-        return "" if math.isnan(self.half) else self.form.format(self.half)
+@cache
+def _reach(freedom: float) -> float:
+    """Return how many standard errors the confidence interval reaches to either side (Student's t)."""
+    return float(stats.t.ppf(0.5 + CONFIDENCE / 2, freedom))
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table.
-
-    Attributes:
-        name: Of its files.
-        title: What it shows, one line.
-        corner: Heading of the first column.
-        columns: Headings of the others.
-        rows: Heading of each row, and its cells.
-        notes: What must be known to read it.
-    """
-
-    name: str
-    title: str
-    corner: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
-    notes: tuple[str, ...] = ()
-
-    def markdown(self) -> str:
-        """Return the table; the best is bold, the second underlined."""
-        marks = {1: "**{}**", 2: "<u>{}</u>"}
-        lines = [
-            f"### {self.title}",
-            "",
-            _line([self.corner, *self.columns]),
-            _line(["---"] + ["---:"] * len(self.columns)),
-        ]
-        for head, cells in self.rows:
-            lines.append(_line([head, *(_marked(cell, marks, " ± ") for cell in cells)]))
-        return "\n".join([*lines, "", *self.notes, ""])
-
-    def latex(self) -> str:
-        """Return a `tabular` with booktabs rules; the best is bold, the second underlined."""
-        marks = {1: r"\textbf{{{}}}", 2: r"\underline{{{}}}"}
-        lines = [f"% {self.title}", rf"\begin{{tabular}}{{l{'r' * len(self.columns)}}}", r"\toprule"]
-        lines += [" & ".join(map(_escaped, [self.corner, *self.columns])) + r" \\", r"\midrule"]
-        for head, cells in self.rows:
-            marked = [_marked(cell, marks, r" $\pm$ ", _escaped) for cell in cells]
-            lines.append(" & ".join([_escaped(head), *marked]) + r" \\")
-        return "\n".join(
-            [*lines, r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in self.notes), ""]
-        )
-
-    def csv(self) -> str:
-        """Return one line per cell: numbers in full, for programs."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow([self.corner, "column", "mean", "half_interval", "frames", "missing", "rank"])
-        for head, cells in self.rows:
-            for column, cell in zip(self.columns, cells, strict=True):
-                writer.writerow([head, column, cell.mean, cell.half, cell.count, cell.missing, cell.rank])
-        return out.getvalue()
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _escaped(text: str) -> str:
-    for mark in "&%_#":
-        text = text.replace(mark, f"\\{mark}")
-    return text
-
-
-def _marked(cell: Cell, marks: dict[int, str], sign: str, escape: object = None) -> str:
-    text = cell.text()
-    if callable(escape):
-        text = escape(text)
-    text = marks.get(cell.rank, "{}").format(text)
-    return f"{text}{sign}{cell.interval()}" if cell.interval() else text
-
-
-def cell_of(values: pd.Series, expected: int, form: str) -> Cell:
+def cell_of(values: NDArray[np.float64], expected: int, form: str) -> Cell:
     """Return mean and confidence interval (Student's t) of the frames of a scene.
 
     Args:
@@ -138,12 +39,12 @@ def cell_of(values: pd.Series, expected: int, form: str) -> Cell:
         expected: Frames that should have one.
         form: How to print it.
     """
-    found = values.dropna().to_numpy(np.float64)
+    found = values[~np.isnan(values)]
     if not len(found):
         return Cell(math.nan, missing=expected, form=form)
     half = math.nan
     if len(found) > 1:
-        half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(found) - 1) * stats.sem(found))
+        half = _reach(len(found) - 1) * float(found.std(ddof=1)) / math.sqrt(len(found))
     return Cell(float(found.mean()), half, len(found), max(0, expected - len(found)), form=form)
 
 
@@ -160,16 +61,10 @@ def average_of(cells: Sequence[Cell], form: str) -> Cell:
     mean = float(np.mean([cell.mean for cell in there]))
     half = math.nan
     if all(cell.count > 1 for cell in there):
-        freedom = [cell.count - 1 for cell in there]
-        squares = [
-            (c.half / stats.t.ppf(0.5 + CONFIDENCE / 2, f)) ** 2 for c, f in zip(there, freedom, strict=True)
-        ]
-        below = sum(s * s / f for s, f in zip(squares, freedom, strict=True))
-        if below > 0:
-            reach = stats.t.ppf(0.5 + CONFIDENCE / 2, sum(squares) ** 2 / below)
-            half = float(reach * math.sqrt(sum(squares)) / len(there))
-        else:
-            half = 0.0
+        squares = [(cell.half / _reach(cell.count - 1)) ** 2 for cell in there]
+        below = sum(s * s / (cell.count - 1) for s, cell in zip(squares, there, strict=True))
+        freedom = sum(squares) ** 2 / below if below > 0 else 1.0
+        half = _reach(freedom) * math.sqrt(sum(squares)) / len(there)
     return Cell(mean, half, sum(cell.count for cell in there), missing, form=form)
 
 
@@ -202,23 +97,39 @@ class Scored:
         self.methods, self.metrics = list(methods), list(metrics)
         self.scenes = list(dict.fromkeys(self.rows["scene"]))
         self.counts = sorted({int(spp) for spp in self.rows["spp"].dropna()})
+        self._values = self.rows[self.metrics].to_numpy(np.float64)
+        self._spp = self.rows["spp"].to_numpy(np.float64, na_value=np.nan)
+        self._names = self.rows["name"].factorize()[0]
+        self._places: dict[tuple[str, str], Places] = self.rows.groupby(["method", "scene"]).indices
+        self._having: dict[tuple[str, int | None], NDArray[np.intp]] = {}
 
     def cell(self, method: str, metric: str, scene: str, spp: int | None = None) -> Cell:
         """Return the mean of a scene's frames, those of one sample count where it is given."""
-        chosen = self.rows[self.rows["scene"] == scene]
-        if spp is not None:
-            chosen = chosen[chosen["spp"] == spp]
-        # Metrics of successive frames exist for fewer frames, and others not for small images: what any
-        # method has is what all should have.
-        having = chosen.dropna(subset=[metric])["name"].nunique()
-        mine = chosen[chosen["method"] == method]
-        return cell_of(mine[metric], having, SCORES[metric].digits)
+        column = self.metrics.index(metric)
+        mine = self._chosen(method, scene, spp)
+        expected = int(self._expected(scene, spp)[column])
+        return cell_of(self._values[mine, column], expected, SCORES[metric].digits)
+
+    def _chosen(self, method: str, scene: str, spp: int | None) -> Places:
+        found = self._places.get((method, scene), np.empty(0, np.intp))
+        return found if spp is None else found[self._spp[found] == spp]
+
+    def _expected(self, scene: str, spp: int | None) -> NDArray[np.intp]:
+        """Return how many frames should have each metric.
+
+        Those of successive frames exist for fewer frames, others not for small images: what any method has is
+        what all should have.
+        """
+        if (scene, spp) not in self._having:
+            rows = np.concatenate([self._chosen(method, scene, spp) for method in self.methods])
+            there = np.zeros((int(self._names.max(initial=-1)) + 1, len(self.metrics)), bool)
+            np.logical_or.at(there, self._names[rows], ~np.isnan(self._values[rows]))
+            self._having[scene, spp] = there.sum(0)
+        return self._having[scene, spp]
 
     def average(self, method: str, metric: str, spp: int | None = None) -> Cell:
         """Return the mean over the scenes."""
-        scenes = [
-            s for s in self.scenes if spp is None or (self.rows[self.rows["scene"] == s]["spp"] == spp).any()
-        ]
+        scenes = [s for s in self.scenes if any(len(self._chosen(m, s, spp)) for m in self.methods)]
         cells = [self.cell(method, metric, scene, spp) for scene in scenes]
         return average_of(cells, SCORES[metric].digits)
 

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from trainer.evaluation.tables import Cell, Scored, average_of, cell_of, ranked, tables_of
+from trainer.evaluation.cells import Cell
+from trainer.evaluation.tables import Scored, average_of, cell_of, ranked, tables_of
 
 
 def rows(values, metric="psnr_wskp", spp=1):
@@ -24,11 +25,11 @@ def rows(values, metric="psnr_wskp", spp=1):
 
 def test_a_scene_has_the_mean_of_its_frames_with_students_interval():
     values = [20.0, 21.0, 23.0, 26.0]
-    cell = cell_of(pd.Series(values), 4, "{:.2f}")
+    cell = cell_of(np.array(values), 4, "{:.2f}")
     low, high = stats.t.interval(0.95, 3, loc=np.mean(values), scale=stats.sem(values))
     assert cell.mean == 22.5
     assert (cell.mean - cell.half, cell.mean + cell.half) == pytest.approx((low, high))
-    assert math.isnan(cell_of(pd.Series([20.0]), 1, "{:.2f}").half)
+    assert math.isnan(cell_of(np.array([20.0]), 1, "{:.2f}").half)
 
 
 def test_an_average_weighs_scenes_alike():
@@ -41,7 +42,7 @@ def test_the_interval_of_an_average_covers_the_truth_as_often_as_it_says():
     inside = 0
     for _ in range(400):
         scenes = [generator.normal(mean, spread, 6) for mean, spread in ((20, 1), (25, 3), (30, 0.2))]
-        cell = average_of([cell_of(pd.Series(scene), 6, "{:.2f}") for scene in scenes], "{:.2f}")
+        cell = average_of([cell_of(scene, 6, "{:.2f}") for scene in scenes], "{:.2f}")
         inside += abs(cell.mean - 25) < cell.half
     assert 0.92 < inside / 400 < 0.98
 

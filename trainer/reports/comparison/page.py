@@ -12,8 +12,9 @@ from typing import Any
 
 import pandas as pd
 
+from trainer.evaluation.cells import Cell, Table
 from trainer.evaluation.plan import INPUT, REFERENCE
-from trainer.evaluation.tables import Cell, Scored, Table, tables_of
+from trainer.evaluation.tables import Scored, tables_of
 from trainer.metrics.measures import SCORES
 from trainer.outputs import replacing
 from trainer.reports.comparison import coding, levels
