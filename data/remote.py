@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import socket
 import tempfile
 import threading
 from collections.abc import Callable
@@ -178,7 +179,8 @@ def send(path: Path, url: str, *, report: Callable[[int], None] | None = None) -
         options["Metadata"] = {SHA256: digest}
     elif is_http(url):
         options["method"] = "put"
-    target = f"{url}.{os.getpid()}-{threading.get_ident()}.partial" if url.startswith("file:") else url
+    # One name for all tries of a machine, so that what a kill left is overwritten and does not pile up.
+    target = f"{url}.{socket.gethostname()}.partial" if url.startswith("file:") else url
 
     def attempt() -> None:
         system = system_of(url)
@@ -195,6 +197,11 @@ def send(path: Path, url: str, *, report: Callable[[int], None] | None = None) -
         patiently("write", url, attempt)
     except ContentError as error:
         raise OSError(f"cannot write {shown(url)}: {error}, several times; check the server") from error
+    except OSError:
+        if target != url:
+            with contextlib.suppress(OSError):  # on a full disk it would keep its space
+                system_of(url).rm_file(inner(target))
+        raise
 
 
 def exists(url: str) -> bool:

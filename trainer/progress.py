@@ -164,12 +164,14 @@ class FrameProgress:
 
     def within(self, frames: float) -> None:
         """Go on by a fraction of a frame."""
+        touch()
         self._at += frames
         if self.bar is not None:
             self.bar.update(self.task, completed=min(self._at, self.total))
 
     def advance(self, name: str) -> None:
         """Count a frame."""
+        touch()
         self.done += 1
         self._at = max(self._at, float(self.done))
         self._begun = self._told = time.monotonic()

@@ -248,6 +248,8 @@ class MLflowTracking(Logger):
             raise OSError(
                 f"cannot write {self._journal.path}: the disk is full; continue with --ckpt_path last"
             )
+        if self._journal is not None:
+            self._journal.sync()
 
     def deliver_up_to(self, offset: int | None) -> None:
         """Keep from the store what lies behind an offset in bytes of the journal; None: nothing.

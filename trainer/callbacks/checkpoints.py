@@ -55,7 +55,7 @@ class _RunCheckpoint(ModelCheckpoint):
         Lightning forgets the best score where the folder has another name; the next validation would then
         replace `best.ckpt` whatever its score.
         """
-        before, now = str(state_dict.get("dirpath") or ""), self.dirpath or ""
+        before, now = str(state_dict.get("dirpath") or ""), str(self.dirpath or "")
         if before != now and Path(before).parts[-3:] == Path(now).parts[-3:]:  # EXPERIMENT/NAME/checkpoints
             state_dict = _moved(state_dict, before, now)
         super().load_state_dict(state_dict)

@@ -40,6 +40,7 @@ class MirrorRun(Callback):
         self._logger: MLflowTracking | None = None
         self._folder = Path()
         self._trouble = ""
+        self._trained = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Begin to watch the run's folder, on the first rank."""
@@ -47,6 +48,7 @@ class MirrorRun(Callback):
         if stage == "fit" and trainer.is_global_zero and isinstance(logger, MLflowTracking):
             self._logger, self._folder = logger, logger.folder
             logger.deliver_up_to(0)
+            self._trained = False
             self._ending.clear()
             self._over.clear()
             self._sent.clear()
@@ -55,8 +57,9 @@ class MirrorRun(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Mirror at once what the run records from now on: its end waits for the tracking store."""
+        self._trained = True  # nothing of it will be recorded again, so the store need not wait for a mirror
         if self._trouble and self._logger is not None and self._thread is not None:
-            self._logger.deliver_up_to(None)  # it is trained: nothing of it will be recorded again
+            self._logger.deliver_up_to(None)
         self._ending.set()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
@@ -99,7 +102,9 @@ class MirrorRun(Callback):
         assert self._logger is not None
         try:
             send_run(self._folder, self.storage, self._sent, journals)
-        except (OSError, ValueError) as error:
+        except Exception as error:  # this thread must not end for what a library raises
+            if self._trained:
+                self._logger.deliver_up_to(None)
             if not self._trouble:
                 print(
                     f"The run is not mirrored: {error}. It is tried again; the tracking store gets what is "

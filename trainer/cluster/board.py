@@ -7,7 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any
 
 from trainer.cluster.engine import Cluster, connected
@@ -134,8 +134,9 @@ def follow(ray: Any, board: Any, job: Any) -> tuple[int, str]:
         return 1, f"the process that conducts the job failed: {reason(error)}"
     except KeyboardInterrupt:
         print("cancelling the job (again Ctrl-C: at once)", file=sys.stderr, flush=True)
-        ray.get(board.cancel.remote())
-        wait(PATIENCE_S)
+        with suppress(ray.exceptions.RayError):  # it ended otherwise
+            ray.get(board.cancel.remote())
+            wait(PATIENCE_S)
         raise
 
 

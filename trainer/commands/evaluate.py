@@ -133,7 +133,8 @@ def run(args: argparse.Namespace) -> int:
     from trainer.progress import FrameProgress
     from trainer.reports.comparison import write_page
 
-    check_device(args.device)
+    if elsewhere() is None:  # on a cluster, the devices are those of its workers
+        check_device(args.device)
     metrics = _metrics(args.metrics)
     methods = methods_of(args.models)
     if args.register_champion:

@@ -117,7 +117,7 @@ class Service:
             raise
 
     async def _answer(self, request: Request, wish: Wish, place: Place) -> Response:
-        self._admit(self.admitted + self.sending)
+        self._admit(max(self.admitted, self.sending))
         place.check(check_headers(request, self.limits).length)
         place.upload.mkdir(parents=True)
         self.sending += 1
