@@ -125,8 +125,18 @@ class LastCheckpoint(_RunCheckpoint):
         else:
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save the end of training, whatever the interval.
+
+        Here, since callbacks that average weights put them in the place of those that would be trained on
+        when training has ended.
+        """
+        super().on_train_epoch_end(trainer, pl_module)
+        if trainer.fit_loop.done:
+            self.on_train_end(trainer, pl_module)
+
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the end of training, whatever the interval."""
+        """Save the end of training where no epoch ended with it."""
         super().on_train_end(trainer, pl_module)
         if self._last_global_step_saved != trainer.global_step:
             self._save(trainer)
