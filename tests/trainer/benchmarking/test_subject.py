@@ -120,7 +120,7 @@ def test_a_cost_that_cannot_be_taken_is_an_error_with_the_reason():
     ],
 )
 def test_every_mode_and_precision_has_figures(kind, mode, precision):
-    case = Case(Method("WSKP", ("layers=1",)), kind, 64, 64, 2, precision, "cpu", mode)
+    case = Case(Method("WSKP", ("layers=2",)), kind, 64, 64, 2, precision, "cpu", mode)
     with exports() as made:
         found = measure(case, SHORT, made)
     assert found.reason is None
