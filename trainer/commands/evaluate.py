@@ -14,6 +14,7 @@ from trainer.options import AddModel, AddOption
 if TYPE_CHECKING:
     import pandas as pd
 
+    from trainer.clips import Clip
     from trainer.evaluation.cells import Table
     from trainer.evaluation.plan import Method, Setting
     from trainer.evaluation.running import Outcome
@@ -150,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
     make_folder(args.output)
     _refuse_other(args.output)
     setting = Setting(
-        args.data, split, _identity(args.data, names), names, args.output, metrics, args.device,
+        args.data, split, _identity(args.data, clips), names, args.output, metrics, args.device,
         args.memory, args.jobs,
     )  # fmt: skip
     _announce(methods, len(names), split)
@@ -237,8 +238,8 @@ def _metrics(named: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(name for name in SCORES if not named or name in named)
 
 
-def _identity(root: str, names: dict[str, str | None]) -> str:
-    """Return what tells a data set from another: the hash of its manifest, or the names of its frames."""
+def _identity(root: str, clips: Sequence[Clip]) -> str:
+    """Return what tells a data set from another: the hash of its manifest, or its files, by size and time."""
     import hashlib
 
     from data.manifest import file_sha256
@@ -248,7 +249,11 @@ def _identity(root: str, names: dict[str, str | None]) -> str:
     manifest = Path(path) / "manifest.json"
     if manifest.is_file():
         return file_sha256(manifest)
-    return hashlib.sha256("\n".join([str(Path(path).resolve()), *names]).encode()).hexdigest()
+    told = [str(Path(path).resolve())]
+    for item in (item for clip in clips for item in clip.items):
+        state = item.source.stat() if item.source is not None else None
+        told.append(f"{item.name} {state.st_size} {state.st_mtime_ns}" if state else item.name)
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()
 
 
 def _refuse_other(folder: Path) -> None:

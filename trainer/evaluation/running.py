@@ -11,7 +11,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
@@ -43,7 +42,6 @@ class Outcome:
         rows: Frame → row, with metrics where they could be taken.
         reason: Why it is not among the results, None where it is.
         crashed: The process died.
-        seconds: Spent by its process in all.
     """
 
     method: Method
@@ -51,7 +49,6 @@ class Outcome:
     rows: dict[str, Row] = field(default_factory=dict)
     reason: str | None = None
     crashed: bool = False
-    seconds: float = 0.0
 
     @property
     def status(self) -> str:
@@ -139,7 +136,6 @@ class Evaluation:
 
     def _one(self, method: Method, pool: ProcessPoolExecutor) -> Outcome:
         outcome = Outcome(method)
-        began = time.monotonic()
         with self._worker(method, outcome) as worker:
             for message in worker:
                 if "facts" in message:
@@ -150,7 +146,6 @@ class Evaluation:
                         self.progress.advance(f"{method.label} {name}")
                 else:
                     self._take(message, outcome, pool)
-        outcome.seconds = time.monotonic() - began
         return outcome
 
     def _identity(self, outcome: Outcome) -> str:
