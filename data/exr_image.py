@@ -10,7 +10,6 @@ header claims.
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
+
+from data.muted import muted
 
 HALF_MAX = 65504.0
 """Largest finite half precision number; larger values are stored in float32."""
@@ -105,7 +106,7 @@ def read_exr(path: str | Path, keep_half: bool = False) -> ExrImage:
     try:
         # The library prints a warning to standard output where it should raise.
         with (
-            contextlib.redirect_stdout(io.StringIO()),
+            muted(),
             OpenEXR.File(str(path), separate_channels=True, num_threads=0) as file,
         ):
             parts = [
@@ -226,7 +227,7 @@ def _check_header(path: Path) -> None:
 def _headers(path: Path) -> list[dict[str, Any]]:
     try:
         with (
-            contextlib.redirect_stdout(io.StringIO()),
+            muted(),
             OpenEXR.File(str(path), separate_channels=True, header_only=True) as file,
         ):
             return [dict(file.header(i)) for i in range(len(file.parts))]

@@ -23,6 +23,7 @@ from trainer import configs, runs
 from trainer.callbacks.alive import Alive
 from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.recorder import RunRecorder
+from trainer.callbacks.same_start import SameStart
 from trainer.elastic import join_ranks
 from trainer.tracking import MLflowTracking
 
@@ -261,8 +262,8 @@ class TrainingCLI(LightningCLI):
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
         join_ranks(self.trainer)
-        if os.environ.get(ALIVE):
-            self.trainer.callbacks.append(Alive())  # type: ignore[attr-defined]  # Lightning types it on use
+        more = [SameStart()] * (self.trainer.world_size > 1) + [Alive()] * bool(os.environ.get(ALIVE))
+        self.trainer.callbacks.extend(more)  # type: ignore[attr-defined]  # Lightning types it on use
 
     def _parse_ckpt_path(self) -> None:
         """Compare the checkpoint's network, and a critic that goes on training, with the configured ones.

@@ -2,10 +2,12 @@
 
 import threading
 from datetime import timedelta
+from types import SimpleNamespace
 
 import pytest
 import torch.distributed as dist
 
+from trainer.callbacks.same_start import SameStart
 from trainer.elastic import agree
 
 
@@ -57,3 +59,27 @@ def test_rank_that_does_not_start_is_named(store):
 def test_rank_whose_first_rank_does_not_start_says_so(store):
     names = attempt(store, [1], 2, timedelta(seconds=0.2))
     assert "rank 1 waited" in str(names[1])
+
+
+@pytest.mark.parametrize(
+    ("steps", "told"),
+    [
+        ([7, 7, 7], None),
+        ([7, 0, 7], "rank 1 at step 0, ranks 0, 2 at step 7"),
+        ([0] * 5 + [9], "0, 1, 2, 3 …"),
+    ],
+)
+def test_ranks_that_begin_from_different_steps_are_refused(monkeypatch, steps, told):
+    def gather(gathered, mine):
+        assert mine == steps[0]
+        gathered[:] = steps
+
+    monkeypatch.setattr(dist, "is_initialized", lambda: True)
+    monkeypatch.setattr(dist, "all_gather_object", gather)
+    trainer = SimpleNamespace(world_size=len(steps), global_step=steps[0])
+    if told is None:
+        SameStart().on_train_start(trainer, None)
+        return
+    with pytest.raises(ValueError, match="different checkpoints") as refused:
+        SameStart().on_train_start(trainer, None)
+    assert told in str(refused.value)

@@ -28,7 +28,7 @@ from trainer.export import export
 from trainer.export.register import weights_of
 from trainer.runs import RunRecord
 from trainer.spool import journal, past
-from trainer.spool.journal import Journal, events
+from trainer.spool.journal import Journal, events, journal_size
 from trainer.spool.sender import Lock
 from trainer.spool.sent import Backlog, Sent, left
 from trainer.spool.store import unreachable
@@ -42,10 +42,11 @@ def _patient(monkeypatch):
     monkeypatch.setattr(sync.time, "sleep", lambda seconds: None)
 
 
-def synced(*folders, every=False):
+def synced(*folders, every=False, unmirrored=False):
     parser = argparse.ArgumentParser()
     sync.add_arguments(parser)
-    return sync.run(parser.parse_args([*map(str, folders), *(["--all"] if every else [])]))
+    options = ["--all"] * every + ["--unmirrored"] * unmirrored
+    return sync.run(parser.parse_args([*map(str, folders), *options]))
 
 
 def uploaded(folder, to=None):
@@ -73,6 +74,36 @@ def test_sync_sends_what_is_left_once_and_says_so(proxy, capsys):
     assert_complete(log)
     assert synced(log.folder) == 0
     assert "nothing is left" in capsys.readouterr().out
+
+
+def test_sync_keeps_from_the_store_what_a_mirror_lacks(proxy, capsys):
+    log = logger(proxy.uri)
+    log.deliver_up_to(0)
+    log.log_metrics({"loss": 1.0}, step=0)
+    log.deliver_up_to(journal_size(log.folder))
+    log.log_metrics({"loss": 2.0}, step=1)
+    killed(log)
+    proxy.start()
+    assert synced(log.folder) == 1
+    said = capsys.readouterr().out
+    assert "sent 1 metric values" in said
+    assert "1 events are left. They were recorded after the run's last copy to its mirror" in said
+    assert history(log, "loss") == [(0, 1.0)]
+    assert synced(log.folder, unmirrored=True) == 0
+    assert history(log, "loss") == [(0, 1.0), (1, 2.0)]
+
+
+def test_run_that_goes_on_without_a_mirror_keeps_nothing_back(proxy):
+    log = logger(proxy.uri)
+    log.deliver_up_to(0)
+    log.log_metrics({"loss": 1.0}, step=0)
+    killed(log)
+    again = continued(log)
+    again.log_metrics({"loss": 2.0}, step=1)
+    killed(again)
+    proxy.start()
+    assert synced(log.folder) == 0
+    assert history(log, "loss") == [(0, 1.0), (1, 2.0)]
 
 
 def test_sync_of_all_finds_the_runs_that_have_something_left(proxy, capsys):

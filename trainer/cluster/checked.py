@@ -62,6 +62,10 @@ class _Checking(TrainingCLI):
     def instantiate_classes(self) -> None:
         """Build nothing."""
 
+    def _restarted(self, config: Any, logger: Any) -> bool:
+        """Look for no run to go on with."""
+        return False
+
     def _parse_ckpt_path(self) -> None:
         """Read no checkpoint: it may lie where only the workers see it."""
 

@@ -85,7 +85,7 @@ class _Head:
 
     def run(self, job: Job, board: Any) -> None:
         """Run the ranks, and restart them where one is lost."""
-        enter(tempfile.mkdtemp(prefix="penumbra-head-"), job.environment)
+        enter(os.getcwd(), job.environment)  # it trains nothing itself, and this node may lack the folder
         workers = f"{job.group.workers} worker" + ("s" if job.group.workers > 1 else "")
         board.write.remote("stderr", f"starting {workers} ({job.launch})\n")
         import ray.train

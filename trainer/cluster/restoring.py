@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from trainer import runs
+from trainer.spool.sent import LIMIT
 
 CHECKPOINTS = ("checkpoints/*.ckpt",)
 KEPT = ("run.json", "launch.json", "config*.yaml", *CHECKPOINTS, "spool/**/*")
 """What a run needs to go on elsewhere."""
+
+OWN = ("lock", LIMIT)
+"""Names of files that mean something on this node only."""
 
 NOTHING = (-1, -1)
 """What is reached where there is no run."""
@@ -22,7 +26,7 @@ def kept_files(folder: Path, patterns: Iterable[str] = KEPT) -> dict[str, Path]:
     """Return the files of a run that it needs to go on elsewhere, by their names in the folder."""
     found = {path for pattern in patterns for path in folder.glob(pattern) if path.is_file()}
     kept = [path for path in sorted(found) if path.name[0] != "." and path.suffix != ".tmp"]
-    return {str(path.relative_to(folder)): path for path in kept if path.name != "lock"}
+    return {str(path.relative_to(folder)): path for path in kept if path.name not in OWN}
 
 
 def whole_last(names: Iterable[str]) -> list[str]:

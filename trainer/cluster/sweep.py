@@ -210,7 +210,7 @@ def _tuner(search: Search, sweep: Sweep, results: Path, resume: bool) -> Any:
             num_samples=search.trials,
             search_alg=OptunaSearch(metric=["score", "cost"], mode=[search.mode, "min"], seed=search.seed),
             scheduler=scheduler,
-            max_concurrent_trials=search.concurrent or None,
+            max_concurrent_trials=search.concurrent or _room(search.group),
         ),
         run_config=tune.RunConfig(
             name=STATE,
@@ -232,8 +232,21 @@ def _resources(group: Group) -> Any:
     one = resources(group)
     if group.workers == 1:
         return one
-    # The processes of a trial reserve their own; this one only waits for them.
-    return tune.PlacementGroupFactory([{"CPU": 0.01}])
+    # The processes of a trial reserve their own, so that this one, which waits for them, must not take a part
+    # of a core from them. It has to reserve something: a byte.
+    return tune.PlacementGroupFactory([{"memory": 1}])
+
+
+def _room(group: Group) -> int | None:
+    """Return how many trials the cluster has room for at one time, where Ray Tune does not see it itself."""
+    if group.workers == 1:
+        return None
+    import ray
+
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    one = resources(group).items()
+    places = sum(int(min(node.get(kind, 0) // each for kind, each in one if each)) for node in nodes)
+    return max(1, places // group.workers)
 
 
 def _telling(search: Search) -> Any:

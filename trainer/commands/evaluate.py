@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from trainer.evaluation.plan import Method, Setting
     from trainer.evaluation.running import Outcome
     from trainer.evaluation.tables import Scored
+    from trainer.evaluation.tracking import Tracked
 
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
 
@@ -124,15 +126,13 @@ def run(args: argparse.Namespace) -> int:
     from data.jobs import elsewhere
     from trainer.commands.denoise import check_device
     from trainer.evaluation.champion import champions_beside
-    from trainer.evaluation.costs import cost_table, costs_of
     from trainer.evaluation.plan import Setting, clips_of, methods_of
-    from trainer.evaluation.record import rows_of, write_record, write_rows, write_tables
+    from trainer.evaluation.record import rows_of
     from trainer.evaluation.running import Evaluation
     from trainer.evaluation.tables import Scored
     from trainer.loading import model_store
     from trainer.outputs import make_folder
     from trainer.progress import FrameProgress
-    from trainer.reports.comparison import write_page
 
     if elsewhere() is None:  # on a cluster, the devices are those of its workers
         check_device(args.device)
@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
         for item in clip.items:
             names[item.name], before = before, item.name if clip.sequence else None
     make_folder(args.output)
-    _refuse_other(args.output)
+    _take_folder(args.output)
     setting = Setting(
         args.data, split, _identity(args.data, clips), names, args.output, metrics, args.device,
         args.memory, args.jobs,
@@ -158,18 +158,37 @@ def run(args: argparse.Namespace) -> int:
     with FrameProgress(len(names) * (len(methods) + 1)) as progress:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
-    write_rows(rows, args.output)
-    costs = {} if args.no_costs or elsewhere() else costs_of(outcomes, rows, setting, _say)
-    table = cost_table(costs, outcomes)
-    tables = write_tables(rows, [o.method.label for o in outcomes], setting, [table] if table else [])
-    write_record(outcomes, rows, setting, costs)
-    write_page(args.output)
-    _print(outcomes, tables, setting)
-    if not args.no_track:
-        _track(outcomes, rows, setting)
+    _write(outcomes, rows, setting, args)
     if args.register_champion:
         _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
     return _status(outcomes, args.strict)
+
+
+def _write(
+    outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting, args: argparse.Namespace
+) -> None:
+    """Write everything that is made of the rows, and record it; what costs most to make again comes first."""
+    from data.jobs import elsewhere
+    from trainer.evaluation.costs import cost_table, costs_of
+    from trainer.evaluation.plots import write_plots
+    from trainer.evaluation.record import write_record, write_rows, write_tables
+    from trainer.evaluation.sheets import write_sheets
+    from trainer.evaluation.tables import Scored
+    from trainer.reports.comparison import write_page
+
+    labels = [outcome.method.label for outcome in outcomes]
+    write_rows(rows, args.output)
+    costs = {} if args.no_costs or elsewhere() else costs_of(outcomes, rows, setting, _say)
+    table = cost_table(costs, outcomes)
+    tables = write_tables(rows, labels, setting, [table] if table else [])
+    write_plots(args.output, rows, Scored(rows, labels, setting.metrics), costs)
+    write_sheets(args.output, rows, outcomes)
+    tracked = None if args.no_track else _track(outcomes, rows, setting)
+    write_record(outcomes, rows, setting, costs, _pages(outcomes, tracked))
+    write_page(args.output)
+    _print(outcomes, tables, setting)
+    if tracked is not None:
+        _keep_files(tracked, args.output)
 
 
 def _say(text: str) -> None:
@@ -186,25 +205,54 @@ def _share(text: str) -> float:
     return value
 
 
-def _track(outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting) -> None:
-    """Record the evaluation; a store that cannot be used is told and loses nothing."""
+@contextmanager
+def _told(uri: str) -> Iterator[None]:
+    """Tell of a store that cannot be used; the evaluation is whole without it."""
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
-    from trainer.evaluation.tracking import EXPERIMENT, track
-    from trainer.spool.store import described, tracking_uri
+    from trainer.spool.store import described
 
-    uri = tracking_uri(None)
     try:
-        track(setting.folder, outcomes, rows, setting.metrics, uri)
+        yield
     except (MlflowException, SQLAlchemyError, OSError) as error:
         first = (str(error).splitlines() or [repr(error)])[0]
-        print(
-            f"note: not recorded in {described(uri)}: {first}; run the command again to do so",
-            file=sys.stderr,
-        )
-        return
-    print(f"recorded in {described(uri)}, experiment {EXPERIMENT}", file=sys.stderr)
+        _say(f"note: not recorded in {described(uri)}: {first}; run the command again to do so")
+
+
+def _track(outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting) -> Tracked | None:
+    """Record what methods reached; None where the store cannot be used."""
+    from trainer.evaluation.tracking import track
+    from trainer.spool.store import tracking_uri
+
+    uri = tracking_uri(None)
+    with _told(uri):
+        return track(setting.folder, outcomes, rows, setting.metrics, uri)
+    return None
+
+
+def _keep_files(tracked: Tracked, folder: Path) -> None:
+    """Record the files."""
+    from trainer.evaluation.tracking import EXPERIMENT, keep_files
+    from trainer.spool.store import described
+
+    with _told(tracked.uri):
+        keep_files(tracked, folder)
+        page = tracked.url()
+        _say(f"recorded in {described(tracked.uri)}, experiment {EXPERIMENT}" + (f": {page}" if page else ""))
+
+
+def _pages(outcomes: Sequence[Outcome], tracked: Tracked | None) -> dict[str, dict[str, str | None]]:
+    """Return label → the pages of its runs in MLflow."""
+    if tracked is None:
+        return {}
+    from trainer.evaluation.tracking import training_url
+
+    found: dict[str, dict[str, str | None]] = {"": {"run_url": tracked.url()}}
+    for outcome in outcomes:
+        label, model = outcome.method.label, outcome.method.model
+        found[label] = {"run_url": tracked.url(label), "training_url": training_url(model, tracked.uri)}
+    return found
 
 
 def _crown(methods: Sequence[Method], scored: Scored, args: argparse.Namespace) -> None:
@@ -249,18 +297,25 @@ def _identity(root: str, clips: Sequence[Clip]) -> str:
     manifest = Path(path) / "manifest.json"
     if manifest.is_file():
         return file_sha256(manifest)
-    told = [str(Path(path).resolve())]
-    for item in (item for clip in clips for item in clip.items):
-        state = item.source.stat() if item.source is not None else None
-        told.append(f"{item.name} {state.st_size} {state.st_mtime_ns}" if state else item.name)
+    sources = [item.source for clip in clips for item in clip.items if item.source is not None]
+    # The frames of some layouts are made of several files.
+    files = sources or [file for file in sorted(Path(path).rglob("*")) if file.is_file()]
+    told = [str(Path(path).resolve()), *(item.name for clip in clips for item in clip.items)]
+    for file in files:
+        state = file.stat()
+        told.append(f"{file} {state.st_size} {state.st_mtime_ns}")
     return hashlib.sha256("\n".join(told).encode()).hexdigest()
 
 
-def _refuse_other(folder: Path) -> None:
-    """Refuse a folder that holds something else than an evaluation."""
+def _take_folder(folder: Path) -> None:
+    """Refuse a folder that holds something else than an evaluation, and mark one that is empty."""
+    from trainer.evaluation.record import RECORD
+    from trainer.evaluation.running import ROWS
+
     there = {path.name for path in folder.iterdir()}
-    if there and not there & {"evaluation.json", "rows.jsonl", "logs"}:
+    if there and not there & {RECORD, ROWS}:
         raise ValueError(f"{folder} holds something else than an evaluation; choose another --output")
+    (folder / ROWS).touch()
 
 
 def _announce(methods: Sequence[Method], frames: int, split: str | None) -> None:

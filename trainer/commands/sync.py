@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 HELP = "Send to the tracking store what runs recorded while it could not be reached."
 TRIES = 3
 """How often a store that does not answer is asked, a few seconds apart."""
+UNMIRRORED = (
+    "They were recorded after the run's last copy to its mirror, and are recorded again where it goes on "
+    "from there; if it never will, --unmirrored sends them."
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "runs", nargs="*", type=Path, metavar="RUN", help="folders of runs, runs/EXPERIMENT/NAME"
     )
     parser.add_argument("--all", action="store_true", help="every run below --root that has something left")
+    parser.add_argument(
+        "--unmirrored",
+        action="store_true",
+        help="also what a mirrored run recorded after its last copy; only if it will never go on from there",
+    )
     parser.add_argument("--root", type=Path, default=Path("runs"), help="folder of all runs (default: runs)")
 
 
@@ -45,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         folders += [folder for folder in found if _has_left(folder)]
         if not folders:
             print(f"nothing is left to send below {arguments.root}")
-    return max([_sent(folder) for folder in folders], default=0)
+    return max([_sent(folder, arguments.unmirrored) for folder in folders], default=0)
 
 
 def _has_left(folder: Path) -> bool:
@@ -58,20 +67,26 @@ def _has_left(folder: Path) -> bool:
         return True
 
 
-def _sent(folder: Path) -> int:
+def _sent(folder: Path, unmirrored: bool) -> int:
     """Send what is left of one run; a damaged one does not keep the others from being sent."""
     try:
-        return send(folder)
+        return send(folder, unmirrored)
     except (ValueError, OSError) as error:
         print(f"{folder}: {error}", file=sys.stderr)
         return 1
 
 
-def send(folder: Path) -> int:
-    """Send what is left of one run and print it; returns 1 where something still is."""
+def send(folder: Path, unmirrored: bool = False) -> int:
+    """Send what is left of one run and print it; returns 1 where something still is.
+
+    Args:
+        folder: Folder of the run.
+        unmirrored: Also what is not in the mirror that the run had. Where the run goes on from that, it is
+            recorded again, and the store would have it twice.
+    """
     from trainer.spool.delivery import Delivery
     from trainer.spool.sender import Lock
-    from trainer.spool.sent import left
+    from trainer.spool.sent import keep_limit, kept_limit, left
     from trainer.spool.store import load_mlflow, quiet_mlflow
 
     waiting = left(folder)
@@ -85,7 +100,10 @@ def send(folder: Path) -> int:
         )
         return 1
     quiet_mlflow(retries=0)
+    if unmirrored:
+        keep_limit(folder, None)
     delivery = Delivery(folder)
+    delivery.limit = kept_limit(folder)
     load_mlflow(delivery.uri)
     try:
         why = _send(delivery, waiting)
@@ -120,7 +138,7 @@ def _send(delivery: Delivery, waiting: int) -> str:
             time.sleep(2.0 * tries)
             continue
         if not moved:
-            return ""
+            return UNMIRRORED if delivery.limit is not None else ""
         tries = 0
         done += moved
         if progress:

@@ -85,19 +85,26 @@ def registered(methods: Sequence[Method], uri: str) -> list[Registered]:
     Raises:
         MlflowException: The store has no such model or alias.
     """
-    client = open_client(uri)
-    found = []
-    for method in methods:
-        match = re.fullmatch(r"models:/+([^/@]+)(?:/([^/]+)|@(.+))", method.model)
-        if match is None:
-            continue
-        name, version, alias = match.groups()
-        if alias:
-            version = str(client.get_model_version_by_alias(name, alias).version)
-        elif version == "latest":
-            version = str(max(int(v.version) for v in client.search_model_versions(f"name = '{name}'")))
-        found.append(Registered(method.label, name, version))
-    return found
+    named = ((method.label, version_of(method.model, uri)) for method in methods)
+    return [Registered(label, *version) for label, version in named if version is not None]
+
+
+def version_of(model: str, uri: str) -> tuple[str, str] | None:
+    """Return name and number of the registered version that a model means, None where it is none.
+
+    Raises:
+        MlflowException: The store has no such model or alias.
+    """
+    match = re.fullmatch(r"models:/+([^/@]+)(?:/([^/]+)|@(.+))", model)
+    if match is None:
+        return None
+    name, version, alias = match.groups()
+    if alias:
+        return name, str(open_client(uri).get_model_version_by_alias(name, alias).version)
+    if version == "latest":
+        there = open_client(uri).search_model_versions(f"name = '{name}'")
+        return name, str(max((int(v.version) for v in there), default=0))
+    return name, version
 
 
 def champion_of(name: str, uri: str) -> str | None:

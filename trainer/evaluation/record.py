@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from typing import Any
 import pandas as pd
 
 from trainer.evaluation.cells import Table
+from trainer.evaluation.layouts import tables_of
 from trainer.evaluation.plan import INPUT, Setting
 from trainer.evaluation.running import Outcome
-from trainer.evaluation.tables import Scored, tables_of
+from trainer.evaluation.tables import Scored
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.metrics.measures import LEFT_OUT, SCORES
 from trainer.outputs import replacing
@@ -63,7 +64,11 @@ def write_rows(rows: pd.DataFrame, folder: Path) -> None:
 
 
 def write_record(
-    outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting, costs: dict[str, dict[str, Any]]
+    outcomes: Sequence[Outcome],
+    rows: pd.DataFrame,
+    setting: Setting,
+    costs: Mapping[str, Mapping[str, Any]],
+    pages: Mapping[str, Mapping[str, str | None]],
 ) -> dict[str, Any]:
     """Write `evaluation.json` and return it.
 
@@ -72,6 +77,7 @@ def write_record(
         rows: From `rows_of`.
         setting: How they were made.
         costs: Label → time and memory per megapixel, of the methods whose were measured.
+        pages: Label → `run_url` and `training_url`, pages of MLflow; the evaluation's under the empty label.
 
     Raises:
         OSError: It cannot be written.
@@ -94,6 +100,8 @@ def write_record(
                 "reason": o.told(),
                 "cost": costs.get(o.method.label),
                 "run_url": None,
+                "training_url": None,
+                **pages.get(o.method.label, {}),
             }
             for o in outcomes
             if o.method.label != INPUT
@@ -104,6 +112,7 @@ def write_record(
             if name in setting.metrics
         ],
         "left_out": LEFT_OUT,
+        "run_url": pages.get("", {}).get("run_url"),
         "frames": [
             {
                 "scene": row.scene, "index": _number(row.frame), "name": row.name_, "spp": _number(row.spp),

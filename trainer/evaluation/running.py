@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,16 @@ from data.jobs import Runner, elsewhere
 from trainer.evaluation.plan import INPUT, NOISY, Method, Setting
 from trainer.evaluation.scores import question_of, score
 from trainer.evaluation.spreading import Told, spread
-from trainer.evaluation.worker import Task, facts_of
+from trainer.evaluation.worker import Task, facts_of, serve
 from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.loading import resolve
 from trainer.progress import FrameProgress
 
 ROWS = "rows.jsonl"
+PROCESSES: Any = get_context("forkserver" if sys.platform == "linux" else "spawn")
+"""How processes are started: by a copy of one that has PyTorch loaded already, which takes seconds."""
+LOADED = ("trainer.evaluation.worker", "trainer.evaluation.scores")
+"""Modules that such a process has loaded."""
 Row = dict[str, Any]
 
 
@@ -93,7 +96,8 @@ class Evaluation:
         noisy = Method(INPUT, NOISY, folder=INPUT)
         if runner := elsewhere():
             return self._spread([noisy], runner) + self._spread(methods, runner)
-        with ProcessPoolExecutor(self.setting.jobs, get_context("spawn"), initializer=_quiet) as pool:
+        PROCESSES.set_forkserver_preload([*LOADED])
+        with ProcessPoolExecutor(self.setting.jobs, PROCESSES, initializer=_quiet) as pool:
             found = []
             for method in (noisy, *methods):
                 found.append(self._one(method, pool))
@@ -196,7 +200,7 @@ class Evaluation:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _Worker(task, path) as worker:
             yield worker
-            code = worker.process.wait()
+            code = worker.wait()
         if code and outcome.reason is None:
             outcome.crashed, outcome.reason = True, _reason(code, path)
 
@@ -205,37 +209,38 @@ class _Worker:
     """A process that denoises; iterates over what it tells."""
 
     def __init__(self, task: Task, log: Path) -> None:
-        with log.open("ab") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "trainer.evaluation.worker"],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True,
-            )  # fmt: skip
-        self.answer(asdict(task))
+        self._link, end = PROCESSES.Pipe()
+        given = (task, end, str(log), dict(os.environ))
+        self.process = PROCESSES.Process(target=serve, args=given)
+        self.process.start()
+        end.close()  # so that its death ends the stream
+        self._heard = os.fdopen(os.dup(self._link.fileno()))
 
     def __enter__(self) -> _Worker:
         return self
 
     def __exit__(self, *exception: object) -> None:
         """End the process, if it still runs."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        self.process.wait()
-        for stream in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):
-                if stream is not None:
-                    stream.close()
+        self.process.terminate()
+        self.process.join()
+        self._heard.close()
+        self._link.close()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        for line in self.process.stdout or ():
-            with suppress(json.JSONDecodeError):  # cut off by its death
-                yield json.loads(line)
+        with suppress(ConnectionResetError):
+            for line in self._heard:
+                with suppress(json.JSONDecodeError):  # cut off by its death
+                    yield json.loads(line)
 
     def answer(self, value: Any) -> None:
         """Send a line."""
         with suppress(OSError):  # it is dead, which its status tells
-            if self.process.stdin is not None:
-                self.process.stdin.write(json.dumps(value) + "\n")
-                self.process.stdin.flush()
+            os.write(self._link.fileno(), json.dumps(value).encode() + b"\n")
+
+    def wait(self) -> int:
+        """Wait for its end and return its exit code, negative for a signal."""
+        self.process.join()
+        return self.process.exitcode or 0
 
 
 def _reason(code: int, log: Path) -> str:

@@ -103,6 +103,11 @@ class Scored:
         self._places: dict[tuple[str, str], Places] = self.rows.groupby(["method", "scene"]).indices
         self._having: dict[tuple[str, int | None], NDArray[np.intp]] = {}
 
+    def counts_of(self, scene: str) -> list[int | None]:
+        """Return the numbers of samples per pixel that a scene has, None alone where it says none."""
+        spp = self.rows.loc[self.rows["scene"] == scene, "spp"].dropna()
+        return [*sorted({int(number) for number in spp})] or [None]
+
     def cell(self, method: str, metric: str, scene: str, spp: int | None = None) -> Cell:
         """Return the mean of a scene's frames, those of one sample count where it is given."""
         column = self.metrics.index(metric)
@@ -171,38 +176,3 @@ NOTE = (
     "Means over the frames of each scene, averages over scenes, ± 95 % confidence over frames; the best is "
     "bold, the second underlined, the input takes no part."
 )
-
-PAPERS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "wskp": ("As tables 1 and 2 of Fan et al. 2021", ("psnr_wskp", "ssim_wskp")),
-    "afgsa": ("As table 1 of Yu et al. 2021", ("rel_mse_half_afgsa", "psnr_afgsa", "ssim_afgsa")),
-    "layer": (
-        "As table 1 of Munkberg and Hasselgren 2020",
-        ("relmse_layer", "smape_wskp", "psnr_layer", "ssim_layer"),
-    ),
-    "nbgd": (
-        "As Meng et al. 2020",
-        ("psnr_nbgd", "ssim_nbgd", "rmse_nbgd", "smape_percent_nbgd", "relmse_nbgd"),
-    ),
-    "perception": (
-        "Perception and time",
-        ("flip_ldr_srgb", "flip_hdr", "ms_ssim_gamma", "change_gamma", "flicker_gamma"),
-    ),
-}
-"""Name → title and metrics of the tables with one row per method."""
-
-
-def tables_of(scored: Scored) -> list[Table]:
-    """Return all tables: overviews as the papers have them, then every metric per scene and per samples."""
-    found = []
-    for name, (title, metrics) in PAPERS.items():
-        chosen = [
-            metric for metric in metrics if metric in scored.metrics and scored.rows[metric].notna().any()
-        ]
-        if chosen:
-            found.append(scored.by_method(chosen, f"overview_{name}", title))
-    for metric in scored.metrics:
-        if scored.rows[metric].notna().any():
-            found.append(scored.by_scene(metric))
-            if len(scored.counts) > 1:
-                found.append(scored.by_spp(metric))
-    return found

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import pandas as pd
 
+from trainer.evaluation.champion import version_of
 from trainer.evaluation.running import Outcome
 from trainer.evaluation.tables import AVERAGE, Scored
-from trainer.spool.store import experiment_id, open_client, tracking_uri
+from trainer.runs import RunRecord, folder_of_checkpoint
+from trainer.spool.store import experiment_id, is_server, open_client, tracking_uri
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
@@ -19,8 +24,41 @@ if TYPE_CHECKING:
 EXPERIMENT = "evaluations"
 PARENT, CHILD = "mlflow.parentRunId", "penumbra.method"
 FILES = ("evaluation.json", "rows.parquet", "rows.csv", "report.html")
+FOLDERS = ("tables", "plots", "pictures")
 BATCH = 1000
 """Metrics of one request, which MLflow limits."""
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The runs of an evaluation.
+
+    Attributes:
+        uri: The store.
+        experiment: Identifier of the experiment there.
+        runs: Label → identifier of the method's run; that of the evaluation under the empty label.
+    """
+
+    uri: str
+    experiment: str
+    runs: dict[str, str]
+
+    def url(self, label: str = "") -> str | None:
+        """Return the address of a run's page; None where the store is no server."""
+        run = self.runs.get(label)
+        return page_of(self.uri, self.experiment, run) if run else None
+
+
+def page_of(uri: str, experiment: str, run: str) -> str | None:
+    """Return the address of the page of a run, None where the store is no server.
+
+    A name and password in the address of the server are left out.
+    """
+    if not is_server(uri):
+        return None
+    parts = urlsplit(uri)
+    plain = parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl().rstrip("/")
+    return f"{plain}/#/experiments/{experiment}/runs/{run}"
 
 
 def track(
@@ -29,22 +67,19 @@ def track(
     rows: pd.DataFrame,
     metrics: Sequence[str],
     uri: str | None = None,
-) -> dict[str, str]:
-    """Record an evaluation, in the runs that it has already or in new ones.
+) -> Tracked:
+    """Record what methods reached, in the runs that the evaluation has already or in new ones.
 
     Args:
-        folder: Of the evaluation, whose files become artifacts.
+        folder: Of the evaluation.
         outcomes: Of all methods.
         rows: One per frame and method.
         metrics: Names of those that were taken.
         uri: The store; by default `MLFLOW_TRACKING_URI` or the local one.
 
-    Returns:
-        Label → identifier of the method's run; that of the evaluation under the empty label.
-
     Raises:
         MlflowException: The store cannot be used.
-        OSError: Likewise, or a file is missing.
+        OSError: Likewise.
     """
     store = tracking_uri(uri)
     client = open_client(store)
@@ -57,17 +92,61 @@ def track(
         tags = {PARENT: parent, CHILD: label, "penumbra.status": outcome.status}
         if told := outcome.told():
             tags["penumbra.reason"] = told[:5000]
+        if trained := training_run(outcome.method.model, store):
+            tags["penumbra.training_run"] = trained[1]
         found[label] = child = _run(client, experiment, label, tags)
         _log(client, child, _params(outcome), _means(scored, label))
         client.set_terminated(child, "FINISHED" if outcome.status == "done" else "FAILED")
+    return Tracked(store, experiment, found)
+
+
+def keep_files(tracked: Tracked, folder: Path) -> None:
+    """Send page, rows, tables, plots and pictures of an evaluation to its run, and end that.
+
+    Raises:
+        MlflowException: The store cannot be used.
+        OSError: Likewise, or a file is missing.
+    """
+    client, parent = open_client(tracked.uri), tracked.runs[""]
     for name in FILES:
         if (folder / name).is_file():
             client.log_artifact(parent, str(folder / name))
-    client.log_artifacts(parent, str(folder / "tables"), "tables")
-    if (folder / "pictures").is_dir():
-        client.log_artifacts(parent, str(folder / "pictures"), "pictures")
+    for name in FOLDERS:
+        if (folder / name).is_dir():
+            client.log_artifacts(parent, str(folder / name), name)
     client.set_terminated(parent, "FINISHED")
-    return found
+
+
+def training_run(model: str, store: str) -> tuple[str, str] | None:
+    """Return the store and the identifier of the run that trained a model, None where that is not known."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        if match := re.match(r"runs:/+([^/]+)", model):
+            return store, match[1]
+        if named := version_of(model, store):
+            run = open_client(store).get_model_version(*named).run_id
+            return (store, run) if run else None
+        path = Path(model)
+        folder = path if path.is_dir() else folder_of_checkpoint(path)
+        record = RunRecord.load(folder) if folder is not None and path.exists() else None
+    except (MlflowException, ValueError, OSError):
+        return None  # whoever loads it has said so
+    return (record.tracking_uri, record.run_id) if record and record.tracking_uri and record.run_id else None
+
+
+def training_url(model: str, store: str) -> str | None:
+    """Return the address of the page of the run that trained a model, None where there is none."""
+    from mlflow.exceptions import MlflowException
+
+    found = training_run(model, store)
+    if found is None or not is_server(found[0]):
+        return None
+    try:
+        experiment = open_client(found[0]).get_run(found[1]).info.experiment_id
+    except (MlflowException, OSError):
+        return None
+    return page_of(found[0], experiment, found[1])
 
 
 def _run(client: MlflowClient, experiment: str, name: str, tags: Mapping[str, str]) -> str:

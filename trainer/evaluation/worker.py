@@ -1,18 +1,19 @@
-"""One method on all frames, in a process of its own: `python -m trainer.evaluation.worker`.
+"""One method on all frames, in a process of its own.
 
-Standard input is a `Task` as one line of JSON and, after the worker told the model's `facts`, the names of
-frames that are there already; standard output is one JSON object a line (`facts`, `row`, `say`, `within`,
-`reason`), standard error is for people. Results are written before their row is told, so that a row means a
-picture.
+The worker tells one JSON object a line (`facts`, `row`, `say`, `within`, `reason`) and hears, after it told
+the model's `facts`, the names of frames that are there already. Results are written before their row is told,
+so that a row means a picture.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -224,23 +225,27 @@ def facts_of(loaded: Loaded) -> dict[str, Any]:
     }
 
 
-def main() -> int:
-    """Read a task, do it; returns the exit status."""
+def serve(task: Task, link: Connection, log: str, environment: dict[str, str]) -> None:
+    """Do a task in a process that was forked for it, and end that with 1 where it could not be begun.
+
+    Args:
+        task: What to do.
+        link: The other end of `Worker`'s streams.
+        log: File for everything that is printed.
+        environment: Variables; those of the process that forks are older.
+    """
     import torch
 
-    given: dict[str, Any] = json.loads(sys.stdin.readline())
-    task = Task(**{**given, "options": tuple(given["options"]), "only": tuple(given["only"])})
+    os.environ.clear()
+    os.environ.update(environment)
+    with open(log, "ab") as file:
+        for number in (1, 2):
+            os.dup2(file.fileno(), number)
     if task.threads:
         torch.set_num_threads(task.threads)
-    worker = Worker(task, sys.stdin, sys.stdout)
-    sys.stdout = sys.stderr  # whatever a library prints must not get between the lines
+    worker = Worker(task, os.fdopen(os.dup(link.fileno())), os.fdopen(os.dup(link.fileno()), "w"))
     try:
         worker.run()
     except (ValueError, OSError) as error:
         worker.tell(reason=(str(error).splitlines() or [repr(error)])[0])
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        sys.exit(1)

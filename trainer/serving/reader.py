@@ -28,6 +28,9 @@ from trainer.serving.wire import Parcel, pack
 SCRATCH = 256 << 20
 """Bytes that it may take beside its libraries and `COPIES` times the frame."""
 
+READY = b"ready\n"
+"""What it says first."""
+
 _HANDLES = 64
 
 
@@ -36,6 +39,8 @@ def main() -> int:
     limits = Limits(**json.loads(sys.argv[1]))
     requests, answers = _streams()
     _limit(limits)
+    answers.write(READY)
+    answers.flush()
     for line in requests:
         try:
             parcel = _answer(json.loads(line), limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -15,12 +16,15 @@ from typing import Any
 
 from data.frame import Frame
 from trainer.serving.limits import Limits, Over, Refusal, Ticket
-from trainer.serving.reader import argument, command
-from trainer.serving.room import no_room
+from trainer.serving.reader import READY, argument, command
+from trainer.serving.room import RETRY, no_room
 from trainer.serving.wire import MAX_LINE, Parcel, receive, unpack
 
 READERS = 2
 """Processes of a service."""
+
+START_S = 60.0
+"""Seconds in which a process has to come up."""
 
 _PATIENCE = 0.05
 _PASSED_ON = ("PATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TZ")
@@ -116,6 +120,13 @@ class _Process:
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
+        self._process: subprocess.Popen[bytes] | None = None
+        self._ready = False
+        self._held = b""
+        with contextlib.suppress(OSError):  # the machine has no room for it now; the next request tries again
+            self._start()
+
+    def _start(self) -> None:
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
         environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
@@ -123,22 +134,22 @@ class _Process:
         environment |= {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
                         "MALLOC_ARENA_MAX": "2"}  # fmt: skip
         self._process = subprocess.Popen(
-            [*command(), argument(limits)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [*command(), argument(self.limits)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL, env=environment, start_new_session=True, bufsize=0,
         )  # fmt: skip
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._stdin, self._out = self._process.stdin, self._process.stdout.fileno()
         os.set_blocking(self._out, False)
-        self._held = b""
 
     def ask(self, request: Mapping[str, Any], ticket: Ticket) -> Parcel:
         """Return the answer to a request.
 
         Raises:
-            Refusal: The process died or took too long.
+            Refusal: The process died or took too long; 503 where it did not even come up.
             Over: Nobody waits for the result any more.
         """
+        self._begin(ticket)
         until = time.monotonic() + self.limits.decode
         try:
             self._stdin.write(json.dumps(request).encode() + b"\n")
@@ -154,11 +165,26 @@ class _Process:
 
     def end(self) -> None:
         """End the process."""
+        if self._process is None:
+            return
         self._process.kill()
         self._process.wait()
         self._stdin.close()
         assert self._process.stdout is not None
         self._process.stdout.close()
+
+    def _begin(self, ticket: Ticket) -> None:
+        """Wait until the process is up, which says nothing about the file."""
+        if self._ready:
+            return
+        try:
+            if self._process is None:
+                self._start()
+            self._ready = self._line(time.monotonic() + START_S, ticket) + b"\n" == READY
+        except (OSError, EOFError, Refusal):
+            pass
+        if not self._ready:
+            raise Refusal(503, "the server's reader of files does not start; try again in 5 s", dict(RETRY))
 
     def _wait(self, until: float, ticket: Ticket) -> None:
         """Wait until there is something to read."""

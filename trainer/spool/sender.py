@@ -14,7 +14,7 @@ from trainer.progress import duration
 from trainer.spool.delivery import Delivery
 from trainer.spool.failures import Kind, OutageError, reason
 from trainer.spool.journal import SPOOL, Journal, shown
-from trainer.spool.sent import Backlog
+from trainer.spool.sent import Backlog, keep_limit, kept_limit
 from trainer.spool.store import described, is_server
 
 INTERVAL_S = 5.0
@@ -120,6 +120,8 @@ class Sender(threading.Thread):
 
     def deliver_up_to(self, offset: int | None) -> None:
         """Keep from the store what lies behind an offset in bytes of the journal; None: nothing."""
+        if offset != kept_limit(self.folder):
+            keep_limit(self.folder, offset)
         self._delivery.limit = offset
 
     def drain(self, wait_s: float) -> int:

@@ -1,7 +1,8 @@
-"""How far the tracking store has the journal of a run, and how many events it lacks."""
+"""How far the tracking store has the journal of a run, may have it, and how many events it lacks."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from array import array
@@ -11,6 +12,8 @@ from pathlib import Path
 
 from trainer.runs import RunRecord
 from trainer.spool.journal import SPOOL, events, journal_size
+
+LIMIT = "limit"
 
 
 @dataclass
@@ -46,6 +49,31 @@ class Sent:
             os.replace(partial, path)
         except OSError:
             partial.unlink(missing_ok=True)
+
+
+def keep_limit(folder: Path, offset: int | None) -> None:
+    """Keep how many bytes of a run's journal the store may have, None for all of them.
+
+    The process that trains may be killed: who sends the journal afterwards has to know.
+    """
+    path = folder / SPOOL / LIMIT
+    with contextlib.suppress(OSError):  # on a full disk the old one stays, which is lower
+        if offset is None:
+            path.unlink(missing_ok=True)
+        else:
+            partial = path.with_suffix(f".{os.getpid()}.tmp")
+            partial.write_text(f"{offset}\n")
+            os.replace(partial, path)
+
+
+def kept_limit(folder: Path) -> int | None:
+    """Return how many bytes of a run's journal the store may have, None where nothing limits them."""
+    try:
+        return int((folder / SPOOL / LIMIT).read_text())
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return 0
 
 
 class Backlog:

@@ -34,8 +34,8 @@ trainer:
 """
 
 
-def weights(place):
-    return torch.load(place.runs[0] / "checkpoints" / "last.ckpt", weights_only=True)
+def weights(place, name):
+    return torch.load(place.runs[0] / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
 def histories(place):
@@ -52,11 +52,21 @@ def histories(place):
 
 def equal(place, other):
     """Check that a training ended as another did: weights to the bit, numbers without gap or duplicate."""
-    one, two = weights(place), weights(other)
-    assert one["global_step"] == two["global_step"] == 12
-    for name, tensor in one["state_dict"].items():
-        assert torch.equal(tensor, two["state_dict"][name]), name
+    for kind in ("last", "best"):
+        one, two = weights(place, kind), weights(other, kind)
+        assert one["global_step"] == two["global_step"]
+        for name, tensor in one["state_dict"].items():
+            assert torch.equal(tensor, two["state_dict"][name]), (kind, name)
+    assert weights(place, "last")["global_step"] == 12
     assert histories(place) == histories(other)
+
+
+@pytest.fixture
+def chance():
+    """The moments at which processes are killed; `PENUMBRA_SEED` repeats those of a test that failed."""
+    seed = int(os.environ.get("PENUMBRA_SEED", random.randrange(2**32)))
+    print(f"PENUMBRA_SEED={seed}")
+    return random.Random(seed)
 
 
 @pytest.fixture(scope="session")
@@ -86,11 +96,13 @@ def test_two_nodes_end_with_the_weights_of_two_processes_to_the_bit(submitting, 
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(submitting, undisturbed, rank):
+def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(
+    submitting, undisturbed, chance, rank
+):
     place, submit = submitting(f"killed{rank}")
     (place.folder / "callbacks.yaml").write_text(CALLBACKS)
     process = place.start(*submit, *OPTIONS)
-    kill_at(place, process, 4, rank)
+    kill_at(place, process, 4, rank, chance)
     output, _ = process.communicate(timeout=400)
     assert process.returncode == 0, output
     assert "its process died" in output
@@ -99,13 +111,13 @@ def test_killed_worker_is_replaced_and_the_run_ends_as_if_nothing_had_happened(s
 
 
 def test_lost_node_is_replaced_from_the_storage_and_the_run_ends_as_if_nothing_had_happened(
-    submitting, nodes, undisturbed
+    submitting, nodes, undisturbed, chance
 ):
     place, submit = submitting("lost")
     (place.folder / "callbacks.yaml").write_text(CALLBACKS)
     place.environment["MLFLOW_TRACKING_URI"] = f"sqlite:///{place.folder / 'mlflow.db'}"
     process = place.start(*submit, *OPTIONS, "--storage", str(place.folder / "shared"))
-    kill_at(place, process, random.choice([2, 4, 6]), 0, "shared")
+    kill_at(place, process, chance.choice([2, 4, 6]), 0, chance, "shared")
     nodes[1]()
     shutil.rmtree(place.folder / "runs")  # which was on the disk of that node
     output, _ = process.communicate(timeout=400)
@@ -114,13 +126,13 @@ def test_lost_node_is_replaced_from_the_storage_and_the_run_ends_as_if_nothing_h
     equal(place, undisturbed)
 
 
-def kill_at(place, process, step, rank, root="runs"):
+def kill_at(place, process, step, rank, chance, root="runs"):
     """Kill the process of a rank some moment after a checkpoint of at least this step was written."""
     deadline = time.monotonic() + 240
     while process.poll() is None and time.monotonic() < deadline:
         for path in place.folder.glob(f"{root}/*/*/checkpoints/last.ckpt"):
             if step <= torch.load(path, weights_only=True)["global_step"] < 12:
-                time.sleep(random.uniform(0, 0.6))
+                time.sleep(chance.uniform(0, 0.6))
                 os.kill(int((place.folder / f"rank-{rank}.pid").read_text()), signal.SIGKILL)
                 return
         time.sleep(0.02)

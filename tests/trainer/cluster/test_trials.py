@@ -9,7 +9,7 @@ from trainer.cluster.fitting import Group
 from trainer.cluster.outcome import FINISHED, STOPPED, Trial
 from trainer.cluster.parent import ParentRun
 from trainer.cluster.space import Range
-from trainer.cluster.sweep import Search, _trial
+from trainer.cluster.sweep import Search, _room, _trial
 from trainer.cluster.trials import Reporting, Sweep
 from trainer.runs import new_folder
 from trainer.tracking import open_client
@@ -78,3 +78,22 @@ def test_run_of_a_search_is_in_the_configured_store_and_ends(tmp_path, monkeypat
     assert run.data.metrics == ({"best/score": 2.0, "best/ms_per_megapixel": 3.0} if trials else {})
     assert [file.path for file in client.list_artifacts(parent.run_id)] == ["trials.txt"]
     assert not (tmp_path / "runs" / "mlflow.db").exists()
+
+
+@pytest.mark.parametrize(
+    ("group", "nodes", "room"),
+    [
+        (Group(workers=1), [{"CPU": 4}], None),
+        (Group(workers=2), [{"CPU": 1}, {"CPU": 1}], 1),
+        (Group(workers=2, cpus=3), [{"CPU": 8}, {"CPU": 5}, {"CPU": 2}], 1),
+        (Group(workers=2, cpus=2, gpus=1), [{"CPU": 16, "GPU": 4}, {"CPU": 16}], 2),
+        (Group(workers=4, gpus=0.5), [{"CPU": 16, "GPU": 4}], 2),
+        (Group(workers=8), [{"CPU": 2}], 1),
+    ],
+)
+def test_as_many_trials_run_at_one_time_as_the_nodes_have_places_for(monkeypatch, group, nodes, room):
+    import ray
+
+    lost = {"Alive": False, "Resources": {"CPU": 64, "GPU": 64}}
+    monkeypatch.setattr(ray, "nodes", lambda: [{"Alive": True, "Resources": n} for n in nodes] + [lost])
+    assert _room(group) == room

@@ -50,3 +50,17 @@ def test_search_tells_trials_front_and_best_configuration(submitting):
     again = place.trainer("tune", *submit[1:3], "--resume", str(folder))
     assert (folder / "trials.txt").read_text() in again
     assert len(json.loads((folder / "trials.json").read_text())["trials"]) == 3
+
+
+def test_trials_of_two_processes_each_use_the_cluster_in_turn(submitting):
+    """The cluster has as many cores as one trial takes: nothing beside its processes may reserve any."""
+    place, submit = submitting("groups")
+    (place.folder / "space.yaml").write_text(SPACE)
+    printed = place.trainer(
+        "tune", *submit[1:], *OPTIONS, "--space", "space.yaml", "--trials", "2", "--no-early-stop"
+    )
+    (results,) = place.folder.glob("runs/tune/*/trials.json")
+    found = json.loads(results.read_text())["trials"]
+    assert [(trial["state"], trial["epoch"]) for trial in found] == [("finished", 3)] * 2
+    told = [word for line in printed.splitlines() for word in ("starts:", "finished") if f" {word}" in line]
+    assert told[:4] == ["starts:", "finished"] * 2

@@ -8,7 +8,8 @@ import pytest
 from scipy import stats
 
 from trainer.evaluation.cells import Cell
-from trainer.evaluation.tables import Scored, average_of, cell_of, ranked, tables_of
+from trainer.evaluation.layouts import tables_of
+from trainer.evaluation.tables import Scored, average_of, cell_of, ranked
 
 
 def rows(values, metric="psnr_wskp", spp=1):

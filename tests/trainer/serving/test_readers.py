@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import signal
@@ -14,6 +15,7 @@ import OpenEXR
 import pytest
 
 from tests.trainer.serving.running import Gate, Running, exr, limits
+from trainer.serving import readers as module
 from trainer.serving.limits import Over, Refusal, Ticket
 from trainer.serving.readers import Readers
 from trainer.serving.room import is_full
@@ -104,9 +106,31 @@ def test_a_reader_that_hangs_is_replaced(tmp_path):
     readers = Readers(1, limits(decode=0.3))
     ticket = Ticket(time.monotonic() + 60)
     try:
-        os.kill(next(iter(readers._all))._process.pid, signal.SIGSTOP)
+        process = next(iter(readers._all))
+        process._begin(ticket)
+        os.kill(process._process.pid, signal.SIGSTOP)
         with pytest.raises(Refusal, match="could not be decoded within"):
             readers.frames(tmp_path, "f0.exr", ticket)
         assert readers.deaths == 1
+    finally:
+        readers.close()
+
+
+@pytest.mark.parametrize("command", [["false"], ["sleep", "60"], ["no/such/program"]])
+def test_a_reader_that_does_not_start_is_no_fault_of_the_file(tmp_path, monkeypatch, command):
+    exr(tmp_path)
+    monkeypatch.setattr(module, "command", lambda: command)
+    monkeypatch.setattr(module, "START_S", 0.5)
+    readers = Readers(1, limits())
+    ticket = Ticket(time.monotonic() + 60)
+    try:
+        for _ in range(2):
+            with pytest.raises(Refusal, match="does not start") as refused:
+                readers.frames(tmp_path, "f0.exr", ticket)
+            assert refused.value.status == 503
+        monkeypatch.undo()
+        with contextlib.suppress(Refusal):  # the one that was started before
+            readers.frames(tmp_path, "f0.exr", ticket)
+        assert readers.frames(tmp_path, "f0.exr", ticket)[0]["name"] == "f0.exr"
     finally:
         readers.close()

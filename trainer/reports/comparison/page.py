@@ -13,8 +13,9 @@ from typing import Any
 import pandas as pd
 
 from trainer.evaluation.cells import Cell, Table
+from trainer.evaluation.layouts import tables_of
 from trainer.evaluation.plan import INPUT, REFERENCE
-from trainer.evaluation.tables import Scored, tables_of
+from trainer.evaluation.tables import Scored
 from trainer.metrics.measures import SCORES
 from trainer.outputs import replacing
 from trainer.reports.comparison import coding, levels
@@ -96,6 +97,7 @@ def _facts(
     return {
         "penumbra": record.get("penumbra"),
         "created": record.get("created"),
+        "run_url": _address(record.get("run_url")),
         "data": record["data"],
         "frames": record["frames"],
         "pictures": {
@@ -139,15 +141,19 @@ def _method(method: Mapping[str, Any], rows: pd.DataFrame) -> dict[str, Any]:
     own = own[own["status"] != "failed"]
     pixels = (own["width"].astype(float) * own["height"].astype(float)) / 1e6
     per_megapixel = (own["seconds"].astype(float) / pixels).dropna()
-    url = method.get("run_url") or ""
     kept = ("label", "model", "class", "options", "status", "reason", "parameters", "cost")
     return {
         **{key: method.get(key) for key in kept},
-        "run_url": url if url.startswith(("http://", "https://")) else None,
+        **{key: _address(method.get(key)) for key in ("run_url", "training_url")},
         "seconds": float(per_megapixel.median()) if len(per_megapixel) else None,
         "nonfinite": int(own["nonfinite"].fillna(0).sum()),
         "frames": len(own),
     }
+
+
+def _address(url: str | None) -> str | None:
+    """Return an address that a page may link to."""
+    return url if url and url.startswith(("http://", "https://")) else None
 
 
 def _scores(

@@ -117,6 +117,9 @@ function describe() {
   const scenes = new Set(frames.map((f) => f.scene)).size, plural = (n, word) => `${n} ${word}${n === 1 ? "" : "s"}`;
   const made = facts.created ? `, ${facts.created.slice(0, 16).replace("T", " ")}` : "";
   $("summary").textContent = `${facts.data.root}${facts.data.split ? `, ${facts.data.split} split` : ""}: ${plural(methods.length, "method")}, ${plural(frames.length, "frame")} of ${plural(scenes, "scene")}${made}`;
+  if (facts.run_url) {
+    $("summary").append(", ", element("a", { href: facts.run_url, target: "_blank", rel: "noopener" }, "MLflow run"));
+  }
   document.title = `${facts.data.root}: comparison of denoisers`;
   $("foot").textContent = `Made by penumbra-denoise ${facts.penumbra ?? ""}. Everything is inside this file; nothing is loaded from elsewhere.`;
   const percent = (v) => `${+(100 * v).toPrecision(3)} %`;

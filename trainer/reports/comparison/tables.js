@@ -60,12 +60,13 @@ function ordered(table) {
 }
 
 function buildMethods() {
-  const heads = ["method", "", "class", "parameters", "s / Mpx", "GB / Mpx", "NaN, Inf pixels", "run"];
+  const heads = ["method", "", "class", "parameters", "s / Mpx", "GB / Mpx", "NaN, Inf pixels", "MLflow runs"];
   const rows = methods.map((m) => {
     const options = Object.entries(m.options ?? {}).map(([k, v]) => `${k}=${typeof v === "object" ? JSON.stringify(v) : v}`).join(", ");
     const status = element("td", { class: "text" }, element("span", { class: `status ${m.status}` }, m.status));
     if (m.reason) status.append(`: ${m.reason}`);
-    const link = m.run_url ? element("a", { href: m.run_url, target: "_blank", rel: "noopener" }, "MLflow run") : "–";
+    const links = [["evaluation", m.run_url], ["training", m.training_url]].filter(([, url]) => url)
+      .map(([text, url]) => element("a", { href: url, target: "_blank", rel: "noopener" }, text));
     const spread = m.cost?.spread ? element("small", {}, `${digits(m.cost.spread[0], 3)} to ${digits(m.cost.spread[1], 3)}`) : "";
     return element("tr", {},
       element("th", { scope: "row", title: m.model ?? m.label }, m.label), status,
@@ -73,7 +74,7 @@ function buildMethods() {
       element("td", {}, m.parameters === null || m.parameters === undefined ? "–" : m.parameters.toLocaleString("en")),
       element("td", {}, digits(m.cost?.seconds_per_megapixel ?? m.seconds, 3), spread),
       element("td", {}, m.cost?.peak_bytes_per_megapixel ? digits(m.cost.peak_bytes_per_megapixel / 1e9, 3) : "–"),
-      element("td", {}, m.nonfinite ? m.nonfinite.toLocaleString("en") : "0"), element("td", {}, link));
+      element("td", {}, m.nonfinite ? m.nonfinite.toLocaleString("en") : "0"), element("td", { class: "links" }, ...(links.length ? links : ["–"])));
   });
   const header = element("thead", {}, element("tr", {}, ...heads.map((h, i) => element("th", { scope: "col", class: i === 1 || i === 2 ? "text" : "" }, h))));
   $("method-table").append(element("table", {}, header, element("tbody", {}, ...rows)));
