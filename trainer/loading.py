@@ -94,6 +94,22 @@ def resolve(
     return _from_class_name(model, device, options, aux)
 
 
+def check_named(model: str, options: Sequence[str] = ()) -> None:
+    """Find out, without loading anything, whether there is what a user has named; arguments as of `resolve`.
+
+    Raises:
+        UsageError: An option is wrong, or the model takes none.
+        ValueError: The class cannot be imported, or is something else.
+        FileNotFoundError: Nothing of that name exists; the message lists the forms.
+    """
+    if re.match(r"(models|runs):/", model) or Path(model).exists():
+        _refuse(model, options)
+    elif _looks_like_path(model):
+        raise FileNotFoundError(f"--model {model}: no such file; expected {FORMS}")
+    else:
+        parse(find_class(class_path_of(model)), options)
+
+
 def _refuse(model: str, options: Sequence[str]) -> None:
     """Refuse what only a denoiser that is named by its class can be asked for."""
     if options:

@@ -35,7 +35,7 @@ METHODS = {
     "NFOR": NOISE,
     "JointNLM": NOISE,
     "NLM": NOISE[:1],
-    "CrossBilateral": NOISE,
+    "CrossBilateral": (),
     "JointBilateral": (),
     "OIDN": (),
 }

@@ -28,6 +28,7 @@ import torch
 
 from tests.benchmarks.timing import Row, print_table, row
 from tests.end_to_end.processes import kill, ranks, readers
+from tests.stack.processes import Server, ServerError
 from tests.stack.servers import Stack
 from trainer.runs import RunRecord
 
@@ -146,8 +147,7 @@ def disturb(
 
     After a process of the training was killed, the next one is when the training has gone on.
     """
-    chance, killed = random.Random(seed), Counter[str]()
-    returning: list[threading.Thread] = []
+    chance, killed, returning = random.Random(seed), Counter[str](), Returning()
     wanted = 1
     while sum(killed.values()) < kills and process.poll() is None:
         await_step(training, process, wanted)
@@ -155,21 +155,70 @@ def disturb(
         victim = chance.choice(VICTIMS)
         if victim.endswith("server"):
             server = stack.tracking if victim == "tracking server" else stack.storage
-            if not server.running:
+            if not server.running or returning.awaits(server):
                 continue
             server.kill()
-            back = threading.Timer(chance.uniform(0, AWAY_S), server.start)
-            back.start()
-            returning.append(back)
+            returning.later(server, chance.uniform(0, AWAY_S))
         elif not strike(process.pid, victim, chance):
             continue
         else:
             wanted = training.step() + APART
         killed[victim] += 1
         print(f"killed {sum(killed.values())} of {kills}: {victim}, at step {training.step()}", flush=True)
-    for back in returning:
-        back.join()
+    returning.wait()
     return killed
+
+
+class Returning:
+    """Starts servers again after a time, on one thread that lives as long as this process.
+
+    A server ends with the thread that started it.
+    """
+
+    def __init__(self) -> None:
+        self._due: list[tuple[float, Server]] = []
+        self._changed = threading.Condition()
+        self._trouble: BaseException | None = None
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def later(self, server: Server, seconds: float) -> None:
+        """Start a server in some seconds."""
+        with self._changed:
+            self._due.append((time.monotonic() + seconds, server))
+            self._changed.notify_all()
+
+    def awaits(self, server: Server) -> bool:
+        """Return whether a server is not back yet."""
+        with self._changed:
+            return any(other is server for _, other in self._due)
+
+    def wait(self) -> None:
+        """Wait until all are back.
+
+        Raises:
+            ServerError: One did not start.
+        """
+        with self._changed:
+            while self._due and self._trouble is None:
+                self._changed.wait()
+        if self._trouble is not None:
+            raise self._trouble
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._due:
+                    self._changed.wait()
+                self._due.sort(key=lambda entry: entry[0])
+                when, server = self._due[0]
+            time.sleep(max(0.0, when - time.monotonic()))
+            try:
+                server.start()
+            except ServerError as error:
+                self._trouble = error
+            with self._changed:
+                self._due.pop(0)
+                self._changed.notify_all()
 
 
 def strike(agent: int, victim: str, chance: random.Random) -> bool:

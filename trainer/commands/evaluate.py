@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,14 +12,11 @@ from trainer.commands.denoise import size_in_bytes
 from trainer.options import AddModel, AddOption
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from trainer.clips import Clip
     from trainer.evaluation.cells import Table
     from trainer.evaluation.plan import Method, Setting
     from trainer.evaluation.running import Outcome
     from trainer.evaluation.tables import Scored
-    from trainer.evaluation.tracking import Tracked
 
 HELP = "compare denoisers on the same frames: metrics, tables, a report"
 
@@ -62,6 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="take only this metric; may be repeated (default: all)",
     )
+    _add_course(parser)
+    _add_keeping(parser)
+
+
+def _add_course(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="cpu, cuda, cuda:1 … (default: cpu)")
     parser.add_argument(
         "--memory",
@@ -78,6 +79,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="do not measure time and memory of the methods (never done on a cluster)",
     )
+
+
+def _add_keeping(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-track", action="store_true", help="do not record the evaluation in MLflow")
     parser.add_argument(
         "--register-champion",
@@ -128,9 +132,10 @@ def run(args: argparse.Namespace) -> int:
     from trainer.evaluation.champion import champions_beside
     from trainer.evaluation.plan import Setting, clips_of, methods_of
     from trainer.evaluation.record import rows_of
+    from trainer.evaluation.results import write_results
     from trainer.evaluation.running import Evaluation
     from trainer.evaluation.tables import Scored
-    from trainer.loading import model_store
+    from trainer.loading import check_named, model_store
     from trainer.outputs import make_folder
     from trainer.progress import FrameProgress
 
@@ -142,12 +147,10 @@ def run(args: argparse.Namespace) -> int:
         (judge,) = _metrics([args.register_champion])
         metrics = tuple(dict.fromkeys([*metrics, judge]))
         methods = methods_of([*args.models, *champions_beside(methods, model_store())])
+    for method in methods:
+        check_named(method.model, method.options)
     clips, split = clips_of(args.data, args.split)
-    names: dict[str, str | None] = {}
-    for clip in clips:
-        before: str | None = None
-        for item in clip.items:
-            names[item.name], before = before, item.name if clip.sequence else None
+    names = _frames(clips)
     make_folder(args.output)
     _take_folder(args.output)
     setting = Setting(
@@ -158,37 +161,22 @@ def run(args: argparse.Namespace) -> int:
     with FrameProgress(len(names) * (len(methods) + 1)) as progress:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
-    _write(outcomes, rows, setting, args)
+    costs = not args.no_costs and elsewhere() is None
+    tables = write_results(outcomes, rows, setting, _say, costs, record=not args.no_track)
+    _print(outcomes, tables, setting)
     if args.register_champion:
         _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
     return _status(outcomes, args.strict)
 
 
-def _write(
-    outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting, args: argparse.Namespace
-) -> None:
-    """Write everything that is made of the rows, and record it; what costs most to make again comes first."""
-    from data.jobs import elsewhere
-    from trainer.evaluation.costs import cost_table, costs_of
-    from trainer.evaluation.plots import write_plots
-    from trainer.evaluation.record import write_record, write_rows, write_tables
-    from trainer.evaluation.sheets import write_sheets
-    from trainer.evaluation.tables import Scored
-    from trainer.reports.comparison import write_page
-
-    labels = [outcome.method.label for outcome in outcomes]
-    write_rows(rows, args.output)
-    costs = {} if args.no_costs or elsewhere() else costs_of(outcomes, rows, setting, _say)
-    table = cost_table(costs, outcomes)
-    tables = write_tables(rows, labels, setting, [table] if table else [])
-    write_plots(args.output, rows, Scored(rows, labels, setting.metrics), costs)
-    write_sheets(args.output, rows, outcomes)
-    tracked = None if args.no_track else _track(outcomes, rows, setting)
-    write_record(outcomes, rows, setting, costs, _pages(outcomes, tracked))
-    write_page(args.output)
-    _print(outcomes, tables, setting)
-    if tracked is not None:
-        _keep_files(tracked, args.output)
+def _frames(clips: Sequence[Clip]) -> dict[str, str | None]:
+    """Return the names of all frames in order, and for each that of the preceding one of its sequence."""
+    names: dict[str, str | None] = {}
+    for clip in clips:
+        before: str | None = None
+        for item in clip.items:
+            names[item.name], before = before, item.name if clip.sequence else None
+    return names
 
 
 def _say(text: str) -> None:
@@ -203,56 +191,6 @@ def _share(text: str) -> float:
     if not 0 <= value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no share; expected a number from 0 to 1, such as 0.01")
     return value
-
-
-@contextmanager
-def _told(uri: str) -> Iterator[None]:
-    """Tell of a store that cannot be used; the evaluation is whole without it."""
-    from mlflow.exceptions import MlflowException
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from trainer.spool.store import described
-
-    try:
-        yield
-    except (MlflowException, SQLAlchemyError, OSError) as error:
-        first = (str(error).splitlines() or [repr(error)])[0]
-        _say(f"note: not recorded in {described(uri)}: {first}; run the command again to do so")
-
-
-def _track(outcomes: Sequence[Outcome], rows: pd.DataFrame, setting: Setting) -> Tracked | None:
-    """Record what methods reached; None where the store cannot be used."""
-    from trainer.evaluation.tracking import track
-    from trainer.spool.store import tracking_uri
-
-    uri = tracking_uri(None)
-    with _told(uri):
-        return track(setting.folder, outcomes, rows, setting.metrics, uri)
-    return None
-
-
-def _keep_files(tracked: Tracked, folder: Path) -> None:
-    """Record the files."""
-    from trainer.evaluation.tracking import EXPERIMENT, keep_files
-    from trainer.spool.store import described
-
-    with _told(tracked.uri):
-        keep_files(tracked, folder)
-        page = tracked.url()
-        _say(f"recorded in {described(tracked.uri)}, experiment {EXPERIMENT}" + (f": {page}" if page else ""))
-
-
-def _pages(outcomes: Sequence[Outcome], tracked: Tracked | None) -> dict[str, dict[str, str | None]]:
-    """Return label → the pages of its runs in MLflow."""
-    if tracked is None:
-        return {}
-    from trainer.evaluation.tracking import training_url
-
-    found: dict[str, dict[str, str | None]] = {"": {"run_url": tracked.url()}}
-    for outcome in outcomes:
-        label, model = outcome.method.label, outcome.method.model
-        found[label] = {"run_url": tracked.url(label), "training_url": training_url(model, tracked.uri)}
-    return found
 
 
 def _crown(methods: Sequence[Method], scored: Scored, args: argparse.Namespace) -> None:
@@ -337,6 +275,7 @@ def _print(outcomes: Sequence[Outcome], tables: Sequence[Table], setting: Settin
     styles = {1: "bold", 2: "underline"}
     for table in (t for t in tables if t.name.startswith("overview")):
         shown = Rich(title=table.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        shown.min_width = min(console.width, len(table.title))
         shown.add_column(table.corner)
         for column in table.columns:
             shown.add_column(column.replace("_", "_\u200b"), justify="right")

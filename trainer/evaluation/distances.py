@@ -29,7 +29,8 @@ class Distance(NamedTuple):
         """Return those of values; NaN where there are none."""
         if not values:
             return cls(math.nan, math.nan)
-        return cls(statistics.fmean(values), statistics.pstdev(values))
+        mean = statistics.fmean(values)
+        return cls(mean, statistics.pstdev(values) if math.isfinite(mean) else math.nan)
 
 
 class Panel(NamedTuple):
@@ -46,6 +47,11 @@ class Panel(NamedTuple):
     higher: bool
     unit: str
     values: Mapping[str, Sequence[float]]
+
+    @property
+    def finite(self) -> bool:
+        """Whether it can be drawn: an error of zero is infinitely better than any other."""
+        return all(math.isfinite(value) for values in self.values.values() for value in values)
 
 
 def distances(

@@ -62,7 +62,7 @@ def _figures(
     rows: pd.DataFrame, scored: Scored, costs: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[str, Any]]:
     lead = [metric for metric in LEAD if metric in scored.metrics]
-    panels = [panel for panel in (panel_of(scored, metric) for metric in lead) if panel is not None]
+    panels = [panel for panel in (panel_of(scored, metric) for metric in lead) if panel and panel.finite]
     if panels:
         yield "distance", distance_figure({"": panels})
     seconds = {label: _seconds(rows, label, costs) for label in scored.methods if label != INPUT}
@@ -132,7 +132,7 @@ def _logarithmic(axes: Any) -> None:
 
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    steps = _STEPS[high >= 10]
+    steps = _STEPS[int(high >= 10)]
     axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_locator(NullLocator())

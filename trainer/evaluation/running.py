@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from data.jobs import Runner, elsewhere
 from trainer.evaluation.plan import INPUT, NOISY, Method, Setting
-from trainer.evaluation.scores import question_of, score
+from trainer.evaluation.scores import question_of
+from trainer.evaluation.scoring import PROCESSES, Scorers
 from trainer.evaluation.spreading import Told, spread
 from trainer.evaluation.worker import Task, facts_of, serve
 from trainer.export.description import DISTRIBUTION, installed_version
@@ -28,10 +27,6 @@ from trainer.loading import resolve
 from trainer.progress import FrameProgress
 
 ROWS = "rows.jsonl"
-PROCESSES: Any = get_context("forkserver" if sys.platform == "linux" else "spawn")
-"""How processes are started: by a copy of one that has PyTorch loaded already, which takes seconds."""
-LOADED = ("trainer.evaluation.worker", "trainer.evaluation.scores")
-"""Modules that such a process has loaded."""
 Row = dict[str, Any]
 
 
@@ -96,12 +91,8 @@ class Evaluation:
         noisy = Method(INPUT, NOISY, folder=INPUT)
         if runner := elsewhere():
             return self._spread([noisy], runner) + self._spread(methods, runner)
-        PROCESSES.set_forkserver_preload([*LOADED])
-        with ProcessPoolExecutor(self.setting.jobs, PROCESSES, initializer=_quiet) as pool:
-            found = []
-            for method in (noisy, *methods):
-                found.append(self._one(method, pool))
-        return found
+        with Scorers(self.setting.jobs) as scorers:
+            return [self._one(method, scorers) for method in (noisy, *methods)]
 
     def _spread(self, methods: Sequence[Method], runner: Runner) -> list[Outcome]:
         """Have clips denoised and scored elsewhere, but those that are there."""
@@ -138,7 +129,7 @@ class Evaluation:
         for name in outcome.rows:
             self.progress.advance(f"{method.label} {name}")
 
-    def _one(self, method: Method, pool: ProcessPoolExecutor) -> Outcome:
+    def _one(self, method: Method, scorers: Scorers) -> Outcome:
         outcome = Outcome(method)
         with self._worker(method, outcome) as worker:
             for message in worker:
@@ -149,7 +140,7 @@ class Evaluation:
                     for name in outcome.rows:
                         self.progress.advance(f"{method.label} {name}")
                 else:
-                    self._take(message, outcome, pool)
+                    self._take(message, outcome, scorers)
         return outcome
 
     def _identity(self, outcome: Outcome) -> str:
@@ -158,7 +149,7 @@ class Evaluation:
         made = (facts["class"], facts["options"], facts["sha256"], installed_version(DISTRIBUTION))
         return json.dumps([*made, setting.data, *sorted(setting.metrics)])
 
-    def _take(self, message: dict[str, Any], outcome: Outcome, pool: ProcessPoolExecutor) -> None:
+    def _take(self, message: dict[str, Any], outcome: Outcome, scorers: Scorers) -> None:
         label = outcome.method.label
         if "say" in message:
             self.progress.say(f"{label}: {message['say']}", message["kind"])
@@ -173,9 +164,9 @@ class Evaluation:
                 self._kept.add(row)
                 self.progress.advance(f"{label} {row['name']}")
             else:
-                self._score(row, outcome.method, pool)
+                self._score(row, outcome.method, scorers)
 
-    def _score(self, row: Row, method: Method, pool: ProcessPoolExecutor) -> None:
+    def _score(self, row: Row, method: Method, scorers: Scorers) -> None:
         """Have a frame scored; its row is kept when that is done."""
         question = question_of(self.setting, method, row)
 
@@ -190,7 +181,7 @@ class Evaluation:
             self._kept.add(row)
             self.progress.advance(f"{method.label} {row['name']}")
 
-        pool.submit(score, question).add_done_callback(finished)
+        scorers.ask(question, finished)
 
     @contextmanager
     def _worker(self, method: Method, outcome: Outcome) -> Iterator[_Worker]:
@@ -253,14 +244,6 @@ def _reason(code: int, log: Path) -> str:
         return f"its process ended with {name}{hint}"
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
     return f"its process ended with {code}: {lines[-1][:200] if lines else 'it said nothing'}"
-
-
-def _quiet() -> None:
-    """Let processes that take scores give way to the methods, and end silently with Ctrl-C."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(5)
 
 
 class _Kept:

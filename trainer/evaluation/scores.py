@@ -15,6 +15,7 @@ from torch import Tensor
 from data.exr_image import read_exr
 from trainer.evaluation.plan import PLACES, REFERENCE, Method, Setting
 from trainer.metrics.measures import SCORES
+from trainer.metrics.sharing import shared
 from trainer.metrics.temporal import change_gamma, flicker_gamma
 
 
@@ -82,15 +83,16 @@ def load(path: Path) -> Tensor:
 
 
 def _still(output: Tensor, reference: Tensor, metrics: Sequence[str]) -> dict[str, float]:
-    values = {}
-    for name in metrics:
-        function = SCORES[name].function
-        if function is None:
-            continue
-        try:
-            values[name] = float(function(output[None], reference[None]))
-        except ValueError:
-            values[name] = math.nan  # the image is smaller than the window
+    values, pair = {}, (output[None], reference[None])
+    with shared():
+        for name in metrics:
+            function = SCORES[name].function
+            if function is None:
+                continue
+            try:
+                values[name] = float(function(*pair))
+            except ValueError:
+                values[name] = math.nan  # the image is smaller than the window
     return values
 
 

@@ -17,7 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.tonemap import srgb_log
-from trainer.metrics.similarity import gaussian_parts, gaussian_similarity, uniform_similarity
+from trainer.metrics.sharing import kept
+from trainer.metrics.similarity import gaussian_means, gaussian_similarity, uniform_similarity
 
 GAMMA = 0.454545
 
@@ -29,11 +30,13 @@ SBMC_BORDER = 21
 """Pixels on every side that SBMC's evaluation leaves out: what its network cannot see whole."""
 
 
+@kept
 def gamma(radiance: Tensor) -> Tensor:
     """Return the display values in [0, 1] on which WSKP evaluates."""
     return radiance.float().clamp_min(0).pow(GAMMA).clamp_max(1)
 
 
+@kept
 def gamma_8bit(radiance: Tensor) -> Tensor:
     """Return the display values on which NBGD evaluates: WSKP's, stored in 8 bits and read again, float64."""
     display = radiance.double().clamp_min(0).pow(GAMMA).clamp_max(1)
@@ -46,7 +49,7 @@ def psnr_wskp(output: Tensor, reference: Tensor) -> Tensor:
     return -10 * torch.log10(error)
 
 
-def ssim_wskp(output: Tensor, reference: Tensor, data_range: float = 2.0) -> Tensor:
+def ssim_wskp(output: Tensor, reference: Tensor) -> Tensor:
     """Structural similarity as in WSKP's tables: gamma images, uniform 7x7 window, sample covariance.
 
     Mean over RGB and over the windows that lie inside the image (Wang et al. 2004, eq. 13). The data range
@@ -56,12 +59,18 @@ def ssim_wskp(output: Tensor, reference: Tensor, data_range: float = 2.0) -> Ten
     Raises:
         ValueError: The image is smaller than the window.
     """
-    return uniform_similarity(gamma(output).double(), gamma(reference).double(), data_range)
+    return _ssim_wskp(output, reference)[0]
 
 
 def ssim_wskp_range1(output: Tensor, reference: Tensor) -> Tensor:
     """WSKP's structural similarity with the true data range of its images, 1."""
-    return ssim_wskp(output, reference, data_range=1.0)
+    return _ssim_wskp(output, reference)[1]
+
+
+@kept
+def _ssim_wskp(output: Tensor, reference: Tensor) -> list[Tensor]:
+    """Return both, which differ in the constants only."""
+    return uniform_similarity(gamma(output).double(), gamma(reference).double(), (2.0, 1.0))
 
 
 def ms_ssim_gamma(output: Tensor, reference: Tensor) -> Tensor:
@@ -79,12 +88,11 @@ def ms_ssim_gamma(output: Tensor, reference: Tensor) -> Tensor:
             f"MS-SSIM needs at least {smallest}x{smallest} pixels, got {tuple(output.shape[-2:])}"
         )
     x, y = gamma(output).double(), gamma(reference).double()
-    total = torch.ones(len(x), dtype=torch.float64)
+    total = torch.ones(len(x), dtype=torch.float64, device=x.device)
     for scale, weight in enumerate(_SCALES):
-        luminance, structure = gaussian_parts(x, y, 11, 1.5, 1.0)
+        whole, structure = gaussian_means(x, y, 11, 1.5, 1.0)
         last = scale == len(_SCALES) - 1
-        part = luminance * structure if last else structure
-        total = total * part.flatten(1).mean(1).clamp_min(0).pow(weight)
+        total = total * (whole if last else structure).clamp_min(0).pow(weight)
         if not last:
             x, y = F.avg_pool2d(x, 2), F.avg_pool2d(y, 2)
     return total.float()
@@ -102,7 +110,7 @@ def ssim_nbgd(output: Tensor, reference: Tensor) -> Tensor:
     Raises:
         ValueError: The image is smaller than the window.
     """
-    return uniform_similarity(gamma_8bit(output), gamma_8bit(reference), 2.0)
+    return uniform_similarity(gamma_8bit(output), gamma_8bit(reference), (2.0,))[0]
 
 
 def rmse_nbgd(output: Tensor, reference: Tensor) -> Tensor:
@@ -172,6 +180,7 @@ def rel_mse_half_afgsa(output: Tensor, reference: Tensor, eps: float = 0.01) -> 
     return 0.5 * relmse_rousselle(output, reference, eps)
 
 
+@kept
 def levels(radiance: Tensor, exponent: float = 2.2, peak: int = 255) -> Tensor:
     """Return the 8-bit image that AFGSA evaluates: `clamp(x^(1/2.2), 0, 1) * 255`, truncated, float64."""
     display = radiance.double().clamp_min(0).pow(1 / exponent).clamp_max(1)
@@ -219,6 +228,7 @@ def ssim_afgsa(
     return gaussian_similarity(levels(output, exponent), levels(reference, exponent), size, sigma, data_range)
 
 
+@kept
 def compressed(radiance: Tensor) -> Tensor:
     """Return the display values in [0, 1] on which the layer paper evaluates: sRGB(log(1 + x)), float64.
 

@@ -1,38 +1,40 @@
 """Structural similarity (Wang et al. 2004, equations 6 to 13) of display values, for every definition in use.
 
-Only windows inside the image count; the mean is over windows and channels.
+Only windows inside the image count; the mean is over windows and channels. Windows are separable, so sums
+along rows are taken before those along columns, and an image is worked on in strips that fit into the caches
+of a processor: the same sums in a fraction of the time and memory of whole images.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+STRIP = 16
+"""Rows of windows that are worked on at a time."""
 
-def uniform_similarity(x: Tensor, y: Tensor, data_range: float, size: int = 7) -> Tensor:
+
+def uniform_similarity(x: Tensor, y: Tensor, data_ranges: Sequence[float], size: int = 7) -> list[Tensor]:
     """Return the mean similarity per image (B,) under a uniform window, with sample covariance.
 
     Args:
         x: Display values (B, C, H, W), float64.
         y: What they should be.
-        data_range: Largest difference of two display values.
+        data_ranges: Largest difference of two display values; one result for each.
         size: Side of the window.
 
     Raises:
         ValueError: The image is smaller than the window.
     """
-    _check_window(x, size)
     unbiased = size * size / (size * size - 1)
-
-    def mean(image: Tensor) -> Tensor:
-        return F.avg_pool2d(image, size, stride=1)
-
-    mx, my = mean(x), mean(y)
-    vx = unbiased * (mean(x * x) - mx * mx)
-    vy = unbiased * (mean(y * y) - my * my)
-    vxy = unbiased * (mean(x * y) - mx * my)
-    return _similarity(mx, my, vx, vy, vxy, data_range)
+    totals = [torch.zeros(len(x), dtype=torch.float64, device=x.device) for _ in data_ranges]
+    for mx, my, vx, vy, vxy in _moments(x, y, [1 / size] * size):
+        for total, data_range in zip(totals, data_ranges, strict=True):
+            luminance, structure = _parts(mx, my, unbiased * vx, unbiased * vy, unbiased * vxy, data_range)
+            total += (luminance * structure).flatten(1).sum(1)
+    return [(total / _windows(x, size)).float() for total in totals]
 
 
 def gaussian_similarity(x: Tensor, y: Tensor, size: int, sigma: float, data_range: float) -> Tensor:
@@ -40,19 +42,40 @@ def gaussian_similarity(x: Tensor, y: Tensor, size: int, sigma: float, data_rang
 
     Arguments and errors as `uniform_similarity`, and `sigma`, the window's standard deviation in pixels.
     """
-    luminance, structure = gaussian_parts(x, y, size, sigma, data_range)
-    return (luminance * structure).flatten(1).mean(1).float()
+    return gaussian_means(x, y, size, sigma, data_range)[0].float()
 
 
-def gaussian_parts(x: Tensor, y: Tensor, size: int, sigma: float, data_range: float) -> tuple[Tensor, Tensor]:
-    """Return luminance and contrast-structure of every window inside the image; as `gaussian_similarity`."""
-    _check_window(x, size)
+def gaussian_means(x: Tensor, y: Tensor, size: int, sigma: float, data_range: float) -> tuple[Tensor, Tensor]:
+    """Return the means (B,), float64, of similarity and of its contrast-structure part alone.
+
+    Arguments and errors as `gaussian_similarity`.
+    """
     offsets = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
     weights = torch.exp(-torch.square(offsets) / (2 * sigma * sigma))
-    weights = weights / weights.sum()
-    maps = torch.stack([x, y, x * x, y * y, x * y])
-    mx, my, mxx, myy, mxy = _weighted(_weighted(maps, weights.tolist(), -1), weights.tolist(), -2)
-    return _parts(mx, my, mxx - mx * mx, myy - my * my, mxy - mx * my, data_range)
+    whole, part = torch.zeros(2, len(x), dtype=torch.float64, device=x.device)
+    for mx, my, vx, vy, vxy in _moments(x, y, (weights / weights.sum()).tolist()):
+        luminance, structure = _parts(mx, my, vx, vy, vxy, data_range)
+        part += structure.flatten(1).sum(1)
+        whole += (luminance * structure).flatten(1).sum(1)
+    return whole / _windows(x, size), part / _windows(x, size)
+
+
+def _moments(x: Tensor, y: Tensor, weights: list[float]) -> Iterator[tuple[Tensor, ...]]:
+    """Yield means of x and y, their variances and covariance under a separable window, strip by strip.
+
+    Raises:
+        ValueError: The image is smaller than the window.
+    """
+    size = len(weights)
+    if min(x.shape[-2:]) < size:
+        raise ValueError(f"SSIM needs at least {size}x{size} pixels, got {tuple(x.shape[-2:])}")
+    rows = x.shape[-2] - size + 1
+    for first in range(0, rows, STRIP):
+        count = min(STRIP, rows - first) + size - 1
+        one, other = x.narrow(-2, first, count), y.narrow(-2, first, count)
+        maps = torch.stack([one, other, one * one, other * other, one * other])
+        mx, my, mxx, myy, mxy = _weighted(_weighted(maps, weights, -1), weights, -2)
+        yield mx, my, mxx - mx * mx, myy - my * my, mxy - mx * my
 
 
 def _weighted(maps: Tensor, weights: list[float], axis: int) -> Tensor:
@@ -64,9 +87,10 @@ def _weighted(maps: Tensor, weights: list[float], axis: int) -> Tensor:
     return total
 
 
-def _check_window(image: Tensor, size: int) -> None:
-    if min(image.shape[-2:]) < size:
-        raise ValueError(f"SSIM needs at least {size}x{size} pixels, got {tuple(image.shape[-2:])}")
+def _windows(image: Tensor, size: int) -> int:
+    """Return the number of windows of an image in all its channels."""
+    channels, height, width = image.shape[1:]
+    return channels * (height - size + 1) * (width - size + 1)
 
 
 def _parts(
@@ -75,9 +99,3 @@ def _parts(
     """Return both factors of the similarity from windows' means, variances and covariance."""
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     return (2 * mx * my + c1) / (mx * mx + my * my + c1), (2 * vxy + c2) / (vx + vy + c2)
-
-
-def _similarity(mx: Tensor, my: Tensor, vx: Tensor, vy: Tensor, vxy: Tensor, data_range: float) -> Tensor:
-    """Return the mean similarity per image from windows' means, variances and covariance."""
-    luminance, structure = _parts(mx, my, vx, vy, vxy, data_range)
-    return (luminance * structure).flatten(1).mean(1).float()

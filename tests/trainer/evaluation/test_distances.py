@@ -32,6 +32,12 @@ def scored(metric="psnr_wskp", **values):
     return Scored(rows(found, metric), list(values), [metric])
 
 
+def test_what_is_infinitely_worse_is_in_the_table_and_not_in_the_plot():
+    made = scored("relmse_layer", a={"s": [0.0], "t": [1.0]}, b={"s": [1.0], "t": [2.0]})
+    assert [cell.mean for cell in distance_table(made, "relmse_layer").rows[-2][1]] == [1.0, math.inf]
+    assert not panel_of(made, "relmse_layer").finite
+
+
 def test_a_table_has_each_scene_then_mean_and_standard_deviation():
     table = distance_table(
         scored(input={"s": [1], "t": [1]}, a={"s": [20, 22], "t": [30]}, b={"s": [19, 21], "t": [34]}),
@@ -64,17 +70,19 @@ def test_a_method_without_every_frame_or_time_is_no_point():
     assert (point.label, point.seconds, point.value) == ("a", 2.0, 21.0)
 
 
+@pytest.mark.parametrize("metric", ["psnr_wskp", "relmse_rousselle"])
 @pytest.mark.parametrize("counts", [(4,), (4, 16)])
-def test_plots_are_written_for_papers_and_for_pages_and_old_ones_removed(tmp_path, counts):
+def test_plots_are_written_for_papers_and_for_pages_and_old_ones_removed(tmp_path, counts, metric):
     import pandas as pd
 
-    parts = [
-        rows({(m, "s"): [20.0 + i + n] for i, m in enumerate(["input", "a", "b"])}, spp=n) for n in counts
-    ]
+    def of(spp):
+        return rows({(m, "s"): [20.0 + i + spp] for i, m in enumerate(["input", "a", "b"])}, metric, spp)
+
+    parts = [of(spp) for spp in counts]
     made = pd.concat(parts, ignore_index=True)
     made["name"] = [f"s/f{spp}" for spp in made["spp"]]
     made = made.assign(status="done", seconds=1.0, width=64, height=32)
-    table = Scored(made, ["input", "a", "b"], ["psnr_wskp"])
+    table = Scored(made, ["input", "a", "b"], [metric])
     (tmp_path / "plots").mkdir()
     (tmp_path / "plots" / "convergence_ssim_wskp.png").write_bytes(b"old")
     costs = {"a": {"seconds_per_megapixel": 0.5}}
@@ -82,7 +90,8 @@ def test_plots_are_written_for_papers_and_for_pages_and_old_ones_removed(tmp_pat
     written = write_plots(tmp_path, made, table, costs)
 
     names = {path.stem for path in written}
-    assert names == {"distance", "time_psnr_wskp"} | ({"convergence_psnr_wskp"} if len(counts) > 1 else set())
+    several = {f"convergence_{metric}"} if len(counts) > 1 else set()
+    assert names == {"distance", f"time_{metric}"} | several
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {path.name for path in written}
     for path in written:
         assert path.read_bytes()[:4] in (b"\x89PNG", b"%PDF")

@@ -202,6 +202,9 @@ def test_jobs_elsewhere_give_the_same_rows(monkeypatch, frames, tmp_path, capsys
         (("--option", "a=b", "--model", "NLM"), 2, "after the --model"),
         (("--model", "x=NLM", "--model", "x=NFOR"), 1, "another column"),
         (("--model", "NLM", "--device", "cuda:9"), 1, "device"),
+        (("--model", "NFORR"), 1, "did you mean NFOR"),
+        (("--model", "runs/none/best.ckpt"), 1, "no such file"),
+        (("--model", "CrossBilateral", "--option", "noise=estimated"), 2, "has no option"),
     ],
 )
 def test_mistakes_are_told_before_any_work(monkeypatch, frames, tmp_path, capsys, arguments, code, told):
