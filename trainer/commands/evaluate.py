@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
     from trainer.evaluation.champion import champions_beside
     from trainer.evaluation.plan import Setting, clips_of, methods_of
     from trainer.evaluation.record import rows_of
-    from trainer.evaluation.results import write_results
+    from trainer.evaluation.results import record_files, write_results
     from trainer.evaluation.running import Evaluation
     from trainer.evaluation.tables import Scored
     from trainer.loading import check_named, model_store
@@ -162,8 +162,10 @@ def run(args: argparse.Namespace) -> int:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
     costs = not args.no_costs and elsewhere() is None
-    tables = write_results(outcomes, rows, setting, _say, costs, record=not args.no_track)
+    tables, tracked = write_results(outcomes, rows, setting, _say, costs, record=not args.no_track)
     _print(outcomes, tables, setting)
+    if tracked is not None:
+        record_files(tracked, args.output, _say)
     if args.register_champion:
         _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
     return _status(outcomes, args.strict)

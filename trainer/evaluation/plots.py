@@ -23,7 +23,14 @@ from trainer.outputs import replacing
 
 SUFFIXES = (".png", ".pdf")
 
-_STEPS = (1, 1.25, 1.5, 2, 3, 5, 7), (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_STEPS = {
+    1.3: (1, 1.02, 1.05, 1.1, 1.15, 1.2, 1.25),
+    10: (1, 1.25, 1.5, 2, 3, 5, 7),
+    math.inf: tuple(step * 10**power for power in range(8) for step in (1, 2, 5)),
+}
+"""End of an axis of ratios → where it has numbers."""
+_LABEL = 28
+"""Letters of a name that fit beside a point."""
 _MARKERS = "osD^vP*X"
 
 
@@ -112,18 +119,18 @@ def _distances(axes: Any, panel: Panel) -> None:
     for place, entry in zip(places, table, strict=True):
         text = f"{entry.mean:.3g}" if entry.mean >= 0.01 else f"{entry.mean:.4f}"
         axes.annotate(text, (place + 0.12, entry.mean), fontsize=8, va="center", bbox=box, zorder=4)
-    axes.set_xticks(list(places), methods, rotation=30, ha="right")
+    axes.set_xticks(list(places), [_short(method) for method in methods], rotation=30, ha="right")
     axes.set_xlim(-0.4, len(methods) - 0.1)
     axes.grid(axis="y", color="#dddddd", linewidth=0.6, which="both")
     if panel.higher:
         axes.invert_yaxis()
         unit = f" [{panel.unit}]" if panel.unit else ""
-        axes.set_title(f"{panel.name}, higher is better (0: best)", fontsize=10)
-        axes.set_ylabel(f"best - {panel.name}{unit}")
+        axes.set_title(panel.name, fontsize=10)
+        axes.set_ylabel(f"below the best{unit}")
     else:
         _logarithmic(axes)
-        axes.set_title(f"{panel.name}, lower is better (1: best)", fontsize=10)
-        axes.set_ylabel(f"{panel.name} / best, logarithmic")
+        axes.set_title(panel.name, fontsize=10)
+        axes.set_ylabel("times the best, logarithmic")
 
 
 def _logarithmic(axes: Any) -> None:
@@ -132,8 +139,9 @@ def _logarithmic(axes: Any) -> None:
 
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    steps = _STEPS[int(high >= 10)]
-    axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
+    steps = next(steps for end, steps in _STEPS.items() if high < end)
+    every = 3 if high > 1e4 else 1
+    axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high][::every]))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -155,7 +163,7 @@ def convergence_figure(scored: Scored, metric: str) -> Any:
         spread = [0 if math.isnan(cell.half) else cell.half for _, cell in found]
         look: dict[str, Any] = {"color": "#777777", "linestyle": "--"} if label == INPUT else {}
         marker = _MARKERS[number % len(_MARKERS)]
-        axes.errorbar(points, values, yerr=spread, label=label, marker=marker, capsize=3, **look)
+        axes.errorbar(points, values, yerr=spread, label=_short(label), marker=marker, capsize=3, **look)
     axes.set_xscale("log", base=2)
     axes.set_xticks(scored.counts)
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -192,23 +200,42 @@ def points_of(scored: Scored, metric: str, seconds: Mapping[str, float]) -> list
 def time_figure(points: Sequence[Point], metric: str) -> Any:
     """Return a figure of a metric over time; the Pareto front is a line."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import StrMethodFormatter
 
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.subplots()
     higher = SCORES[metric].higher
     front = pareto([(point.seconds, point.value) for point in points], higher)
-    axes.plot(*zip(*front, strict=True), color="tab:orange", label="Pareto front", zorder=0)
+    axes.plot(*zip(*front, strict=True), "o-", ms=12, mfc="none", color="tab:orange", label="Pareto front")
+    low, high = min(point.seconds for point in points), max(point.seconds for point in points)
     for point in points:
         place = point.seconds, point.value
         axes.errorbar(*place, yerr=point.half, fmt="o", color="tab:blue", capsize=3)
-        axes.annotate(point.label, place, fontsize=8, xytext=(5, 5), textcoords="offset points")
+        # Names lie towards the middle of the picture.
+        right = high > low and math.log(point.seconds / low) > 0.6 * math.log(high / low)
+        side: dict[str, Any] = {"xytext": (-6, 6), "ha": "right"} if right else {"xytext": (6, 6)}
+        axes.annotate(_short(point.label), place, fontsize=8, textcoords="offset points", **side)
     axes.set_xscale("log")
-    axes.margins(x=0.15)
+    axes.margins(x=0.25)
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(_between(points))
     axes.set_xlabel("seconds per megapixel")
     axes.set_ylabel(f"{metric}, {'higher' if higher else 'lower'} is better")
     axes.grid(color="#dddddd", linewidth=0.6)
     axes.legend(fontsize=9)
     return figure
+
+
+def _between(points: Sequence[Point]) -> Any:
+    """Return what writes numbers between the powers of ten: all where times lie close together."""
+    from matplotlib.ticker import NullFormatter, StrMethodFormatter
+
+    times = [point.seconds for point in points]
+    return StrMethodFormatter("{x:g}") if max(times) < 10 * min(times) else NullFormatter()
+
+
+def _short(label: str) -> str:
+    return label if len(label) <= _LABEL else f"{label[: _LABEL - 1]}…"
 
 
 def pareto(points: Sequence[tuple[float, float]], higher: bool) -> list[tuple[float, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 import pandas as pd
 
@@ -29,8 +30,8 @@ def write_results(
     say: Say,
     costs: bool = True,
     record: bool = True,
-) -> list[Table]:
-    """Write and record everything; what costs most to make again comes first. Returns the tables.
+) -> tuple[list[Table], Tracked | None]:
+    """Write everything, and record numbers; what costs most to make again comes first.
 
     Args:
         outcomes: Of the input and of all methods.
@@ -39,6 +40,9 @@ def write_results(
         say: Told what takes time, and where it is recorded.
         costs: Whether time and memory of the methods are measured.
         record: Whether it is recorded in MLflow; a store that cannot be used is told and loses nothing.
+
+    Returns:
+        The tables, and the runs in MLflow, which lack the files yet.
 
     Raises:
         OSError: A file cannot be read or written.
@@ -54,12 +58,15 @@ def write_results(
     tracked = _tracked(outcomes, rows, setting, say) if record else None
     write_record(outcomes, rows, setting, measured, _pages(outcomes, tracked))
     write_page(folder)
-    if tracked is not None:
-        with _telling(tracked.uri, say):
-            keep_files(tracked, folder)
-            page = f": {tracked.url()}" if tracked.url() else ""
-            say(f"recorded in {described(tracked.uri)}, experiment {EXPERIMENT}{page}")
-    return tables
+    return tables, tracked
+
+
+def record_files(tracked: Tracked, folder: Path, say: Say) -> None:
+    """Record the files, and say where; a store that cannot be used is told and loses nothing."""
+    with _telling(tracked.uri, say):
+        keep_files(tracked, folder)
+        page = f": {tracked.url()}" if tracked.url() else ""
+        say(f"recorded in {described(tracked.uri)}, experiment {EXPERIMENT}{page}")
 
 
 @contextmanager
