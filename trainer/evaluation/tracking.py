@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 import pandas as pd
 
 from trainer.evaluation.champion import version_of
+from trainer.evaluation.plan import INPUT
 from trainer.evaluation.running import Outcome
 from trainer.evaluation.tables import AVERAGE, Scored
 from trainer.runs import RunRecord, folder_of_checkpoint
@@ -25,6 +26,8 @@ EXPERIMENT = "evaluations"
 PARENT, CHILD = "mlflow.parentRunId", "penumbra.method"
 FILES = ("evaluation.json", "rows.parquet", "rows.csv", "report.html")
 FOLDERS = ("tables", "plots", "pictures")
+NOTE_LENGTH = 7000
+"""Characters of a run's description; stores take 8000."""
 BATCH = 1000
 """Metrics of one request, which MLflow limits."""
 
@@ -86,6 +89,7 @@ def track(
     experiment = experiment_id(client, store, EXPERIMENT)
     parent = _run(client, experiment, folder.resolve().name, {"penumbra.evaluation": str(folder.resolve())})
     scored = Scored(rows, [outcome.method.label for outcome in outcomes], metrics)
+    _log(client, parent, _about(rows), {})
     found = {"": parent}
     for outcome in outcomes:
         label = outcome.method.label
@@ -114,7 +118,18 @@ def keep_files(tracked: Tracked, folder: Path) -> None:
     for name in FOLDERS:
         if (folder / name).is_dir():
             client.log_artifacts(parent, str(folder / name), name)
+    client.set_tag(parent, "mlflow.note.content", _note(folder))
     client.set_terminated(parent, "FINISHED")
+
+
+def _note(folder: Path) -> str:
+    """Return the description of the run, which its page shows: as many overviews as it may hold."""
+    texts = [path.read_text() for path in sorted((folder / "tables").glob("overview_*.md"))]
+    note = ""
+    for text in texts:
+        if len(note) + len(text) < NOTE_LENGTH:
+            note += text + "\n"
+    return note
 
 
 def training_run(model: str, store: str) -> tuple[str, str] | None:
@@ -165,6 +180,12 @@ def _run(client: MlflowClient, experiment: str, name: str, tags: Mapping[str, st
 
 def _quoted(text: str) -> str:
     return text.replace("\\", "\\\\").replace("'", "\\'")
+
+
+def _about(rows: pd.DataFrame) -> dict[str, str]:
+    frames = rows[rows["method"] == INPUT]
+    scenes = ", ".join(dict.fromkeys(frames["scene"].dropna().astype(str)))
+    return {"frames": str(len(frames)), "scenes": scenes[:500]}
 
 
 def _params(outcome: Outcome) -> dict[str, str]:

@@ -36,6 +36,8 @@ def test_methods_are_below_the_run_of_the_evaluation_with_scores_and_reasons(eva
     runs = {run.info.run_name: run for run in runs_of(client)}
     assert set(runs) == {"out", "input", "half", "greedy"}
     parent = runs.pop("out")
+    assert (parent.data.params["frames"], parent.data.params["scenes"]) == ("3", "room")
+    assert "| half |" in parent.data.tags["mlflow.note.content"]
     assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
     assert {name: run.info.status for name, run in runs.items()} == {
         "input": "FINISHED", "half": "FINISHED", "greedy": "FAILED",
