@@ -32,6 +32,8 @@ LAUNCH_VARIABLE = "PENUMBRA_LAUNCH"
 """Names a launch."""
 TRAINING_VARIABLE = "PENUMBRA_TRAINING"
 """Names one training whatever its command line: that of a Ray worker names other files every time."""
+SUBMITTED = "submit "
+"""How names begin that are given once."""
 
 
 @dataclass
@@ -150,11 +152,14 @@ class Launch:
         restarts: Whether this is a restart, as far as that can be told.
         unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is
             a restart: who names a launch means that.
+        once: Where a run of the same identity is finished there is nothing left to do: a restart came for a
+            process that died after the end of the training.
     """
 
     identity: str
     restarts: bool = False
     unfinished: bool = False
+    once: bool = False
 
 
 def current_launch(
@@ -170,17 +175,17 @@ def current_launch(
         arguments: Its command line without the program, that of `sys.argv` where None.
     """
     if training := environment.get(TRAINING_VARIABLE):
-        return Launch(training, unfinished=True)
+        return Launch(training, unfinished=True, once=training.startswith(SUBMITTED))
     what = _digest(sys.argv[1:] if arguments is None else arguments)
-    if named := environment.get(LAUNCH_VARIABLE):
-        return Launch(f"{named} {what}", unfinished=True)
     restarts = environment.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+    if named := environment.get(LAUNCH_VARIABLE):
+        return Launch(f"{named} {what}", unfinished=True, once=restarts)
     torchrun = environment.get("TORCHELASTIC_RUN_ID")
     if torchrun and torchrun != "none":  # its default
-        return Launch(f"torchrun {torchrun} {what}", restarts, unfinished=True)
+        return Launch(f"torchrun {torchrun} {what}", restarts, unfinished=True, once=restarts)
     if "SLURM_JOB_ID" in environment:
         restarts = restarts or environment.get("SLURM_RESTART_COUNT", "0") != "0"
-        return Launch(f"slurm {environment['SLURM_JOB_ID']} {what}", restarts)
+        return Launch(f"slurm {environment['SLURM_JOB_ID']} {what}", restarts, once=restarts)
     if torchrun and environment.get("WORLD_SIZE") != environment.get("LOCAL_WORLD_SIZE"):
         if environment.get("RANK") == "0":
             _warn_of_nameless_launch()
@@ -190,7 +195,7 @@ def current_launch(
 
         agent = psutil.Process(os.getppid())
         place = f"{socket.gethostname()} {agent.pid} {agent.create_time():.2f}"
-        return Launch(f"torchrun {place} {what}", restarts)
+        return Launch(f"torchrun {place} {what}", restarts, once=restarts)
     return None
 
 
@@ -266,9 +271,18 @@ def run_of_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
     """Return the run folder that a launch is to go on with, None where it is to begin a new run."""
     if not (launch.restarts or launch.unfinished):
         return None
+    return _noted_as(launch, root, experiment, finished=False)
+
+
+def finished_by_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
+    """Return the run folder that shows that a launch has nothing left to do, None where it has."""
+    return _noted_as(launch, root, experiment, finished=True) if launch.once else None
+
+
+def _noted_as(launch: Launch, root: Path, experiment: str, finished: bool) -> Path | None:
     for folder in reversed(run_folders(root, experiment)):
         noted = noted_launch(folder)
-        if noted.get("launch") == launch.identity and not noted.get("finished"):
+        if noted.get("launch") == launch.identity and bool(noted.get("finished")) is finished:
             return folder
     return None
 

@@ -36,12 +36,21 @@ def run_training(verb: str, arguments: list[str]) -> int:
     quiet_libraries()
     # LightningCLI reads sys.argv, and so do the processes that its DDP launcher starts.
     sys.argv = [sys.argv[0], verb, *configs.resolve_arguments(arguments)]
-    cli = TrainingCLI()
+    try:
+        cli = TrainingCLI()
+    except AlreadyTrainedError as done:
+        if getattr(rank_zero_only, "rank", 0) == 0:
+            print(done, file=sys.stderr)
+        return 0
     if verb != "fit" and cli.trainer.is_global_zero:
         from trainer.reports.tables import print_scores
 
         print_scores(cli.trainer.callback_metrics, "val" if verb == "validate" else "test")
     return 0
+
+
+class AlreadyTrainedError(Exception):
+    """A restart came for a training that has ended well."""
 
 
 def quiet_libraries() -> None:
@@ -221,8 +230,14 @@ class TrainingCLI(LightningCLI):
         A run that was killed before its first checkpoint starts again in the same folder and MLflow run.
         """
         launch = runs.current_launch()
-        folder = launch and runs.run_of_launch(launch, Path(logger.root), logger.experiment)
+        root, experiment = Path(logger.root), logger.experiment
+        folder = launch and runs.run_of_launch(launch, root, experiment)
         if not folder:
+            done = launch and runs.finished_by_launch(launch, root, experiment)
+            if done:
+                raise AlreadyTrainedError(
+                    f"restarted: the run {done.name} is finished, nothing is left to do"
+                )
             return False
         newest = runs.checkpoint_of_launch(folder)
         config.ckpt_path = str(newest) if newest else None

@@ -32,8 +32,8 @@ from tests.stack.processes import Server, ServerError
 from tests.stack.servers import Stack
 from trainer.runs import RunRecord
 
-KILLS, APART = 30, 8
-"""Processes that are killed; steps between two that stop the training."""
+KILLS, APART, ENOUGH = 30, 8, 24
+"""Processes that are killed, steps between two that stop the training, and steps of the training for each."""
 AWAY_S = 10.0
 PATIENCE_S = 600
 VICTIMS = ("first rank", "other rank", "reader", "tracking server", "S3 server")
@@ -265,7 +265,7 @@ def compare(disturbed: Training, alone: Training, whole: Training) -> list[Row]:
 
 def run(kills: int = KILLS, seed: int = 1) -> list[Row]:
     """Train undisturbed and disturbed, and compare."""
-    steps = kills * APART + 2 * APART
+    steps = kills * ENOUGH
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         local = {"PENUMBRA_CACHE": str(folder / "cache")}

@@ -12,6 +12,7 @@ from trainer.runs import (
     current_launch,
     end_launch,
     find_checkpoint,
+    finished_by_launch,
     folder_of_checkpoint,
     new_folder,
     run_of_launch,
@@ -102,6 +103,30 @@ def test_finished_run_is_not_continued_by_its_launch(tmp_path):
     assert run_of_launch(Launch("a", restarts=True, unfinished=True), tmp_path, "exp") is None
 
 
+@pytest.mark.parametrize("once", [True, False])
+def test_restart_of_a_finished_training_has_nothing_left_to_do(tmp_path, once):
+    launch = Launch("a", restarts=True, once=once)
+    run = make_run(tmp_path, "20260101-000000")
+    begin_launch(run, launch)
+    assert finished_by_launch(launch, tmp_path, "exp") is None
+    end_launch(run)
+    assert finished_by_launch(launch, tmp_path, "exp") == (run if once else None)
+    assert finished_by_launch(Launch("b", once=True), tmp_path, "exp") is None
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"PENUMBRA_LAUNCH": "a", "TORCHELASTIC_RUN_ID": "none"},
+        {"TORCHELASTIC_RUN_ID": "7"},
+        {"SLURM_JOB_ID": "7"},
+    ],
+)
+def test_only_a_restart_takes_a_finished_training_for_its_own(environment):
+    assert not current_launch(environment, []).once
+    assert current_launch(environment | {"TORCHELASTIC_RESTART_COUNT": "1"}, []).once
+
+
 def test_restart_goes_on_from_what_its_launch_saved_or_started_from(tmp_path):
     folder = make_run(tmp_path, "20260101-000000")
     last = folder / "checkpoints" / "last.ckpt"
@@ -182,7 +207,7 @@ def test_place_of_installation_does_not_matter_to_a_launch(tmp_path, monkeypatch
 def test_named_training_is_the_same_whatever_its_command_line():
     environment = {"PENUMBRA_TRAINING": "submit 1", "PENUMBRA_LAUNCH": "x", "TORCHELASTIC_RUN_ID": "job"}
     for arguments in ([], ["fit", "--config", "scratch/a.yaml"]):
-        assert current_launch(environment, arguments) == Launch("submit 1", unfinished=True)
+        assert current_launch(environment, arguments) == Launch("submit 1", unfinished=True, once=True)
 
 
 def test_torchrun_without_an_identity_is_known_by_its_process_on_one_machine_only(capsys):

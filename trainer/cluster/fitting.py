@@ -15,6 +15,7 @@ from typing import Any
 from trainer.cluster.board import conduct, reason, sending
 from trainer.cluster.checked import Training
 from trainer.cluster.engine import Cluster, enter, forwarded
+from trainer.runs import SUBMITTED
 
 PERMANENT = (ValueError, FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
 """What another attempt would meet again: a wrong configuration, a missing file."""
@@ -75,7 +76,7 @@ def submit_training(
         OSError: The cluster cannot be reached.
         KeyboardInterrupt: Ctrl-C, after the job was cancelled.
     """
-    launch = f"submit {uuid.uuid4().hex[:12]}"
+    launch = f"{SUBMITTED}{uuid.uuid4().hex[:12]}"
     job = Job(training, group, str(folder), forwarded(address), storage, launch)
     return conduct(Cluster(address, group.workers, group.cpus, group.gpus), _Head, job)
 
@@ -197,7 +198,8 @@ def _train(job: Job, board: Any) -> None:
         torch.set_num_threads(int(threads))
     rank_zero_only.rank = int(os.environ["RANK"])  # type: ignore[attr-defined]
     quiet_libraries()
-    share_newest(Path(job.training.root), job.training.experiment, job.storage)
+    if share_newest(Path(job.training.root), job.training.experiment, job.storage):
+        return  # the process that was lost had nothing left to do
     with tempfile.TemporaryDirectory(prefix="penumbra-config-") as folder:
         arguments = job.training.restored(Path(folder))
         sys.argv = ["trainer", "fit", *arguments]

@@ -57,10 +57,13 @@ def reached(folder: Path | None) -> tuple[int, int]:
     return runs.attempt_of(folder), step
 
 
-def share_newest(root: Path, experiment: str, storage: str | None) -> None:
+def share_newest(root: Path, experiment: str, storage: str | None) -> bool:
     """Give every node the run of this launch as the node, or the storage, that is furthest has it.
 
     To be called on all ranks of a group. In a first attempt there is no such run, and nothing happens.
+
+    Returns:
+        Whether the run is finished, so that nothing is left to do.
 
     Raises:
         OSError: The storage cannot be read, and no node has the run.
@@ -71,14 +74,19 @@ def share_newest(root: Path, experiment: str, storage: str | None) -> None:
     rank = dist.get_rank()
     launch = runs.current_launch()
     if launch is None:
-        return
+        return False
+    done = runs.finished_by_launch(launch, root, experiment) is not None
     folder = runs.run_of_launch(launch, root, experiment)
     trouble: Exception | None = None
-    if rank == 0 and storage:
+    if rank == 0 and storage and not done:
         folder, trouble = _with_storage(storage, launch.identity, root, folder)
+        done = launch.once and trouble is None and _finished_there(storage, launch.identity)
     mine = reached(folder)
-    states: list[Any] = [None] * dist.get_world_size()
-    dist.all_gather_object(states, mine)
+    gathered: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(gathered, (mine, done))
+    if any(finished for _, finished in gathered):
+        return True
+    states = [state for state, _ in gathered]
     furthest = max(states)
     if trouble is not None:
         if furthest == NOTHING:
@@ -89,7 +97,7 @@ def share_newest(root: Path, experiment: str, storage: str | None) -> None:
             file=sys.stderr,
         )
     if min(states) == furthest:
-        return
+        return False
     holder = states.index(furthest)
     parcel: list[Any] = [_packed(folder) if rank == holder and folder is not None else None]
     dist.broadcast_object_list(parcel, src=holder)
@@ -102,6 +110,16 @@ def share_newest(root: Path, experiment: str, storage: str | None) -> None:
             file=sys.stderr,
         )
     dist.barrier()
+    return False
+
+
+def _finished_there(storage: str, launch: str) -> bool:
+    from trainer.cluster.storage import is_finished
+
+    try:
+        return is_finished(storage, launch)
+    except (OSError, ValueError):
+        return False
 
 
 def _with_storage(

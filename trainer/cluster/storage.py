@@ -147,6 +147,17 @@ def fetch_run(storage: str, launch: str, root: Path, newer_than: tuple[int, int]
     return folder
 
 
+def is_finished(storage: str, launch: str) -> bool:
+    """Return whether a storage has the run of a launch, to its end.
+
+    Raises:
+        OSError: The storage cannot be read.
+        ValueError: What it holds is damaged.
+    """
+    pointer = _launch_url(storage_url(storage), launch)
+    return exists(pointer) and bool(_read_json(pointer).get("finished"))
+
+
 def bring_run(place: str, folder: Path, newer_than: tuple[int, int] = NOTHING) -> bool:
     """Bring a mirrored run into a folder; returns whether it has `reached` more than what is given.
 
