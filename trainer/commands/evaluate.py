@@ -12,6 +12,8 @@ from trainer.commands.denoise import size_in_bytes
 from trainer.options import AddModel, AddOption
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from trainer.clips import Clip
     from trainer.evaluation.cells import Table
     from trainer.evaluation.plan import Method, Setting
@@ -82,6 +84,9 @@ def _add_course(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_keeping(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--force", action="store_true", help="discard an evaluation of other frames in the output folder"
+    )
     parser.add_argument("--no-track", action="store_true", help="do not record the evaluation in MLflow")
     parser.add_argument(
         "--register-champion",
@@ -130,13 +135,13 @@ def run(args: argparse.Namespace) -> int:
     from data.jobs import elsewhere
     from trainer.commands.denoise import check_device
     from trainer.evaluation.champion import champions_beside
+    from trainer.evaluation.keeping import identity_of, take_folder
     from trainer.evaluation.plan import Setting, clips_of, methods_of
     from trainer.evaluation.record import rows_of
     from trainer.evaluation.results import record_files, write_results
     from trainer.evaluation.running import Evaluation
     from trainer.evaluation.tables import Scored
     from trainer.loading import check_named, model_store
-    from trainer.outputs import make_folder
     from trainer.progress import FrameProgress
 
     if elsewhere() is None:  # on a cluster, the devices are those of its workers
@@ -151,23 +156,22 @@ def run(args: argparse.Namespace) -> int:
         check_named(method.model, method.options)
     clips, split = clips_of(args.data, args.split)
     names = _frames(clips)
-    make_folder(args.output)
-    _take_folder(args.output)
+    identity = identity_of(args.data, clips)
+    take_folder(args.output, identity, args.data, args.force)
     setting = Setting(
-        args.data, split, _identity(args.data, clips), names, args.output, metrics, args.device,
-        args.memory, args.jobs,
-    )  # fmt: skip
+        args.data, split, identity, names, args.output, metrics, args.device, args.memory, args.jobs
+    )
     _announce(methods, len(names), split)
     with FrameProgress(len(names) * (len(methods) + 1)) as progress:
         outcomes = Evaluation(setting, progress).run(methods)
     rows = rows_of(outcomes, setting)
     costs = not args.no_costs and elsewhere() is None
     tables, tracked = write_results(outcomes, rows, setting, _say, costs, record=not args.no_track)
-    _print(outcomes, tables, setting)
     if tracked is not None:
         record_files(tracked, args.output, _say)
     if args.register_champion:
         _crown(methods, Scored(rows, [o.method.label for o in outcomes], metrics), args)
+    _print(outcomes, rows, tables, setting)
     return _status(outcomes, args.strict)
 
 
@@ -226,38 +230,6 @@ def _metrics(named: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(name for name in SCORES if not named or name in named)
 
 
-def _identity(root: str, clips: Sequence[Clip]) -> str:
-    """Return what tells a data set from another: the hash of its manifest, or its files, by size and time."""
-    import hashlib
-
-    from data.manifest import file_sha256
-    from data.root import SAMPLE, resolve_root
-
-    path = resolve_root(root).path if root.startswith(SAMPLE) else Path(root).expanduser()
-    manifest = Path(path) / "manifest.json"
-    if manifest.is_file():
-        return file_sha256(manifest)
-    sources = [item.source for clip in clips for item in clip.items if item.source is not None]
-    # The frames of some layouts are made of several files.
-    files = sources or [file for file in sorted(Path(path).rglob("*")) if file.is_file()]
-    told = [str(Path(path).resolve()), *(item.name for clip in clips for item in clip.items)]
-    for file in files:
-        state = file.stat()
-        told.append(f"{file} {state.st_size} {state.st_mtime_ns}")
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()
-
-
-def _take_folder(folder: Path) -> None:
-    """Refuse a folder that holds something else than an evaluation, and mark one that is empty."""
-    from trainer.evaluation.record import RECORD
-    from trainer.evaluation.running import ROWS
-
-    there = {path.name for path in folder.iterdir()}
-    if there and not there & {RECORD, ROWS}:
-        raise ValueError(f"{folder} holds something else than an evaluation; choose another --output")
-    (folder / ROWS).touch()
-
-
 def _announce(methods: Sequence[Method], frames: int, split: str | None) -> None:
     which = f"of the {split} split" if split else "in all"
     plural = "s" * (frames != 1)
@@ -266,33 +238,29 @@ def _announce(methods: Sequence[Method], frames: int, split: str | None) -> None
     )
 
 
-def _print(outcomes: Sequence[Outcome], tables: Sequence[Table], setting: Setting) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table as Rich
+def _print(
+    outcomes: Sequence[Outcome], rows: pd.DataFrame, tables: Sequence[Table], setting: Setting
+) -> None:
+    """Print the overviews, and what is missing; everything is written by now."""
+    from trainer.reports.tables import print_overviews
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=100)
-    styles = {1: "bold", 2: "underline"}
-    for table in (t for t in tables if t.name.startswith("overview")):
-        shown = Rich(title=table.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        shown.min_width = min(console.width, len(table.title))
-        shown.add_column(table.corner)
-        for column in table.columns:
-            shown.add_column(column.replace("_", "_\u200b"), justify="right")
-        for head, cells in table.rows:
-            shown.add_row(
-                head, *(f"[{styles[c.rank]}]{c.text()}[/]" if c.rank in styles else c.text() for c in cells)
-            )
-        console.print(shown)
+    print_overviews([table for table in tables if table.name.startswith("overview")])
     for outcome in outcomes:
         if told := outcome.told():
-            print(f"{outcome.method.label}: {outcome.status}: {told}", file=sys.stderr)
-    lacking = sum(not row.get("reference", True) for row in outcomes[0].rows.values())
+            _say(f"{outcome.method.label}: {outcome.status}: {told}")
+    noisy = outcomes[0].rows.values()
+    lacking = sum(not row.get("reference", True) for row in noisy)
     if lacking:
-        print(f"{lacking} frames have no reference: denoised, without metrics", file=sys.stderr)
-    print(f"written to {setting.folder}; look at {setting.folder / 'report.html'}", file=sys.stderr)
+        _say(f"{lacking} frame{'s have' if lacking > 1 else ' has'} no reference: denoised, without metrics")
+    if repaired := sum(row.get("repaired", 0) > 0 for row in noisy):
+        _say(f"{repaired} references have NaN or Inf pixels, which were replaced by their neighbours")
+    empty = [name for name in setting.metrics if rows[name].isna().all()]
+    if empty and lacking < len(noisy):
+        _say(
+            f"no frame has {', '.join(empty)}: those of successive frames need a sequence with motion or "
+            "positions, ms_ssim_gamma 176x176 pixels"
+        )
+    _say(f"written to {setting.folder}; look at {setting.folder / 'report.html'}")
 
 
 def _status(outcomes: Sequence[Outcome], strict: bool) -> int:

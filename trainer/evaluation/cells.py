@@ -102,9 +102,14 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _escaped(text: str) -> str:
-    for mark in "&%_#":
-        text = text.replace(mark, f"\\{mark}")
-    return text
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+_LATEX = {
+    **{mark: f"\\{mark}" for mark in "&%_#${}"},
+    "\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+}  # fmt: skip
 
 
 def _marked(cell: Cell, marks: Mapping[int, str], sign: str, escape: Callable[[str], str] = str) -> str:

@@ -135,7 +135,7 @@ def decide(
             return float("-inf")
         return cell.mean if higher else -cell.mean
 
-    best = max(entries, key=average)
+    best = max(entries, key=lambda entry: (average(entry), entry.version == before))
     if average(best) == float("-inf"):
         return Decision(name, best.version, before, (f"has no {metric} of every frame",))
     old = next((entry for entry in entries if entry.version == before), None)
@@ -144,6 +144,8 @@ def decide(
     reasons = []
     for scene in scored.scenes:
         mine, theirs = (scored.cell(entry.label, metric, scene) for entry in (best, old))
+        if not theirs.count or theirs.missing:
+            continue  # the champion failed where the other one did not
         worse = theirs.mean - mine.mean if higher else mine.mean - theirs.mean
         if worse > tolerance * abs(theirs.mean):
             reasons.append(f"is worse in {scene}: {metric} {mine.text()}, champion {theirs.text()}")

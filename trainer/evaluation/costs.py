@@ -38,6 +38,8 @@ def costs_of(
     """
     from trainer.benchmarking import cost
 
+    if rows["width"].isna().all():
+        return {}  # no frame could be read
     size = (max(SMALLEST, int(rows["width"].median())), max(SMALLEST, int(rows["height"].median())))
     spp = int(rows["spp"].median()) if rows["spp"].notna().any() else 8
     path = setting.folder / COSTS
@@ -47,7 +49,7 @@ def costs_of(
         label = outcome.method.label
         if label == INPUT or outcome.status == "skipped":
             continue
-        key = json.dumps([label, outcome.facts, size, spp, setting.device, setting.memory])
+        key = json.dumps([label, outcome.facts, size, spp, setting.device, setting.memory])  # with releases
         if key not in known:
             say(f"measuring time and memory of {label} at {size[0]}x{size[1]}")
             try:

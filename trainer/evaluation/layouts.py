@@ -19,7 +19,11 @@ PAPERS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "perception": (
         "Perception and time",
-        ("flip_ldr_srgb", "flip_hdr", "ms_ssim_gamma", "change_gamma", "flicker_gamma"),
+        ("flip_ldr_srgb", "flip_hdr", "ms_ssim_gamma", "change_gamma", "flicker_gamma", "lpips_alex_gamma"),
+    ),
+    "others": (
+        "Other definitions",
+        ("relmse_rousselle", "relmse_tungsten", "relmse_sbmc", "ssim_wskp_range1"),
     ),
 }
 """Name → title and metrics of the tables with one row per method."""

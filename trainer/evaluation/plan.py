@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from trainer.clips import Clip, find_clips
@@ -12,6 +13,8 @@ from trainer.clips import Clip, find_clips
 INPUT, REFERENCE, PLACES = "input", "reference", "places"
 """Folders below `images` beside those of the methods: the noisy frames, what they should be, and where each
 pixel was in the frame before."""
+
+_RESERVED = {INPUT, REFERENCE, PLACES}
 
 NOISY = "trainer.evaluation.noisy.Noisy"
 
@@ -47,6 +50,8 @@ class Setting:
         device: Where methods run.
         memory: Bytes that a call of a method may take.
         jobs: Processes that take scores.
+        exposures: Exposure at which a frame is judged, for all methods: that of the input. It is known when
+            the input was read.
     """
 
     root: str
@@ -58,6 +63,7 @@ class Setting:
     device: str = "cpu"
     memory: int = 2 * 1024**3
     jobs: int = 1
+    exposures: dict[str, float] = field(default_factory=dict)
 
 
 def methods_of(named: Sequence[tuple[str, Sequence[str]]]) -> list[Method]:
@@ -88,7 +94,8 @@ def methods_of(named: Sequence[tuple[str, Sequence[str]]]) -> list[Method]:
 def _split(text: str) -> tuple[str | None, str]:
     """Return the label and the model of `LABEL=MODEL`."""
     label, sign, model = text.partition("=")
-    if not sign or not label.strip() or not model or any(mark in label for mark in ":/\\"):
+    named = sign and label.strip() and model and not any(mark in label for mark in ":/\\")
+    if not named or Path(text).exists():
         return None, text
     return label.strip(), model
 
@@ -105,17 +112,18 @@ def _short(model: str) -> str:
 
 
 def _with_folders(methods: Iterable[Method]) -> list[Method]:
-    found: list[Method] = []
-    taken = {INPUT, REFERENCE, PLACES}
-    for method in methods:
-        name = re.sub(r"[^A-Za-z0-9._-]+", "-", method.label).strip("-.")[:60] or "method"
-        folder, number = name, 1
-        while folder.lower() in taken:
-            number += 1
-            folder = f"{name}-{number}"
-        taken.add(folder.lower())
-        found.append(replace(method, folder=folder))
-    return found
+    return [replace(method, folder=folder_of(method.label)) for method in methods]
+
+
+def folder_of(label: str) -> str:
+    """Return the name of a method's folder, which follows from its label alone.
+
+    That is the label where it makes a good name, and otherwise what does of it, with a hash.
+    """
+    if re.fullmatch(r"\w[A-Za-z0-9._-]{0,59}", label, re.ASCII) and label.lower() not in _RESERVED:
+        return label
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", label).strip("-.")[:48] or "method"
+    return f"{name}-{hashlib.sha256(label.encode()).hexdigest()[:8]}"
 
 
 def clips_of(root: str, split: str) -> tuple[list[Clip], str | None]:

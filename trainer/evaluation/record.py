@@ -21,7 +21,7 @@ from trainer.outputs import replacing
 
 RECORD = "evaluation.json"
 FIRST = ("method", "scene", "frame", "name", "spp", "width", "height", "exposure", "reference", "seconds",
-         "nonfinite", "status", "reason")  # fmt: skip
+         "nonfinite", "repaired", "status", "reason")  # fmt: skip
 
 
 def rows_of(outcomes: Sequence[Outcome], setting: Setting) -> pd.DataFrame:
@@ -35,9 +35,10 @@ def rows_of(outcomes: Sequence[Outcome], setting: Setting) -> pd.DataFrame:
             row = outcome.rows.get(name, {"status": "failed", "reason": outcome.reason or "not reached"})
             facts = {
                 k: known.get(name, {}).get(k)
-                for k in ("scene", "frame", "spp", "width", "height", "exposure", "reference")
+                for k in ("scene", "frame", "spp", "width", "height", "reference", "repaired")
             }
-            rows.append({**facts, **row, "method": outcome.method.label, "name": name})
+            judged = {"exposure": known.get(name, {}).get("exposure")}  # that of the input for all
+            rows.append({**facts, **row, **judged, "method": outcome.method.label, "name": name})
     frame = pd.DataFrame(rows)
     for column in (*FIRST, *setting.metrics):
         if column not in frame:
@@ -45,7 +46,7 @@ def rows_of(outcomes: Sequence[Outcome], setting: Setting) -> pd.DataFrame:
     frame[list(setting.metrics)] = frame[list(setting.metrics)].astype("float64")
     for column in ("seconds", "exposure"):
         frame[column] = frame[column].astype("float64")
-    for column in ("frame", "spp", "width", "height", "nonfinite"):
+    for column in ("frame", "spp", "width", "height", "nonfinite", "repaired"):
         frame[column] = frame[column].astype("Int64")
     frame["reference"] = frame["reference"].fillna(value=False).astype(bool)
     return frame[[*FIRST, *setting.metrics]]
@@ -116,14 +117,15 @@ def write_record(
         "frames": [
             {
                 "scene": row.scene, "index": _number(row.frame), "name": row.name_, "spp": _number(row.spp),
-                "width": _number(row.width), "height": _number(row.height), "exposure": row.exposure,
+                "width": _number(row.width), "height": _number(row.height),
+                "exposure": None if pd.isna(row.exposure) else row.exposure,
                 "reference": bool(row.reference),
             }
             for row in frames.rename(columns={"name": "name_"}).itertuples()
         ],
     }  # fmt: skip
     with replacing(setting.folder / RECORD) as path:
-        path.write_text(json.dumps(record, indent=1))
+        path.write_text(json.dumps(record, indent=1, allow_nan=False))
     return record
 
 
@@ -148,6 +150,9 @@ def write_tables(
     tables = [*more, *tables_of(Scored(rows, methods, setting.metrics))]
     folder = setting.folder / "tables"
     folder.mkdir(exist_ok=True)
+    for old in folder.iterdir():
+        if old.suffix in (".md", ".tex", ".csv"):
+            old.unlink()
     for table in tables:
         for suffix, text in ((".md", table.markdown()), (".tex", table.latex()), (".csv", table.csv())):
             with replacing(folder / f"{table.name}{suffix}") as path:

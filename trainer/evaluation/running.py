@@ -8,26 +8,22 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from data.jobs import Runner, elsewhere
+from trainer.evaluation.keeping import Kept, Row, identity_of_rows
 from trainer.evaluation.plan import INPUT, NOISY, Method, Setting
 from trainer.evaluation.scores import question_of
 from trainer.evaluation.scoring import PROCESSES, Scorers
 from trainer.evaluation.spreading import Told, spread
 from trainer.evaluation.worker import Task, facts_of, serve
-from trainer.export.description import DISTRIBUTION, installed_version
 from trainer.loading import resolve
 from trainer.progress import FrameProgress
-
-ROWS = "rows.jsonl"
-Row = dict[str, Any]
 
 
 @dataclass
@@ -79,7 +75,8 @@ class Evaluation:
 
     def __init__(self, setting: Setting, progress: FrameProgress) -> None:
         self.setting, self.progress = setting, progress
-        self._kept = _Kept(setting.folder / ROWS)
+        self._kept = Kept(setting.folder)
+        self._trouble: OSError | None = None
 
     def run(self, methods: Sequence[Method]) -> list[Outcome]:
         """Return what came of the input and of every method, in order.
@@ -90,9 +87,21 @@ class Evaluation:
         """
         noisy = Method(INPUT, NOISY, folder=INPUT)
         if runner := elsewhere():
-            return self._spread([noisy], runner) + self._spread(methods, runner)
+            found = self._spread([noisy], runner)
+            self._judge_by(found[0])
+            return found + self._spread(methods, runner)
         with Scorers(self.setting.jobs) as scorers:
-            return [self._one(method, scorers) for method in (noisy, *methods)]
+            found = [self._one(noisy, scorers)]
+            self._judge_by(found[0])
+            found += [self._one(method, scorers) for method in methods]
+        if self._trouble is not None:
+            raise self._trouble
+        return found
+
+    def _judge_by(self, noisy: Outcome) -> None:
+        """Judge all methods at the exposures of the input: one that fails at a frame may choose another."""
+        exposures = {name: row["exposure"] for name, row in noisy.rows.items() if "exposure" in row}
+        self.setting = replace(self.setting, exposures=exposures)
 
     def _spread(self, methods: Sequence[Method], runner: Runner) -> list[Outcome]:
         """Have clips denoised and scored elsewhere, but those that are there."""
@@ -107,7 +116,7 @@ class Evaluation:
                 if "say" in message:
                     self.progress.say(f"{method.label}: {message['say']}", message["kind"])
                 if "row" in message:
-                    row = {"method": method.label, "identity": self._identity(outcome), **message["row"]}
+                    row = self._row(outcome, message["row"])
                     outcome.rows[row["name"]] = row
                     self._kept.add(row)
                     self.progress.advance(f"{method.label} {row['name']}")
@@ -117,6 +126,10 @@ class Evaluation:
             found[label].crashed, found[label].reason = True, reason
         return list(found.values())
 
+    def _row(self, outcome: Outcome, told: Row) -> Row:
+        identity = identity_of_rows(outcome.facts, self.setting)
+        return {"method": outcome.method.label, "identity": identity, **told}
+
     def _prepare(self, outcome: Outcome) -> None:
         """Load a method here to know what it is, and which of its rows are there."""
         method = outcome.method
@@ -125,7 +138,7 @@ class Evaluation:
         except (ValueError, OSError) as error:
             outcome.reason = (str(error).splitlines() or [repr(error)])[0]
             return
-        outcome.rows = self._kept.of(method.label, self._identity(outcome))
+        outcome.rows = self._kept.of(method, identity_of_rows(outcome.facts, self.setting))
         for name in outcome.rows:
             self.progress.advance(f"{method.label} {name}")
 
@@ -133,21 +146,17 @@ class Evaluation:
         outcome = Outcome(method)
         with self._worker(method, outcome) as worker:
             for message in worker:
+                if self._trouble is not None:
+                    raise self._trouble
                 if "facts" in message:
                     outcome.facts = message["facts"]
-                    outcome.rows = self._kept.of(method.label, self._identity(outcome))
+                    outcome.rows = self._kept.of(method, identity_of_rows(outcome.facts, self.setting))
                     worker.answer(list(outcome.rows))
                     for name in outcome.rows:
                         self.progress.advance(f"{method.label} {name}")
                 else:
                     self._take(message, outcome, scorers)
         return outcome
-
-    def _identity(self, outcome: Outcome) -> str:
-        """Return what rows must have been made by to be taken over."""
-        facts, setting = outcome.facts, self.setting
-        made = (facts["class"], facts["options"], facts["sha256"], installed_version(DISTRIBUTION))
-        return json.dumps([*made, setting.data, *sorted(setting.metrics)])
 
     def _take(self, message: dict[str, Any], outcome: Outcome, scorers: Scorers) -> None:
         label = outcome.method.label
@@ -158,7 +167,7 @@ class Evaluation:
         elif "reason" in message:
             outcome.reason = message["reason"]
         elif "row" in message:
-            row = {"method": label, "identity": self._identity(outcome), **message["row"]}
+            row = self._row(outcome, message["row"])
             outcome.rows[row["name"]] = row
             if row["status"] == "failed":
                 self._kept.add(row)
@@ -178,7 +187,10 @@ class Evaluation:
                 row.update(answer.result())
             else:
                 row.update(status="failed", reason=f"not scored: {error}")
-            self._kept.add(row)
+            try:
+                self._kept.add(row)
+            except OSError as error:  # told by the thread that runs the methods
+                self._trouble = error
             self.progress.advance(f"{method.label} {row['name']}")
 
         scorers.ask(question, finished)
@@ -244,26 +256,3 @@ def _reason(code: int, log: Path) -> str:
         return f"its process ended with {name}{hint}"
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
     return f"its process ended with {code}: {lines[-1][:200] if lines else 'it said nothing'}"
-
-
-class _Kept:
-    """The rows on disk, one JSON object a line; a line that was cut off by a kill is left out."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._lock = threading.Lock()
-        self._rows: list[Row] = []
-        if path.is_file():
-            whole = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
-            self._rows = [json.loads(line) for line in whole]
-            path.write_text("".join(whole))
-
-    def of(self, label: str, identity: str) -> dict[str, Row]:
-        """Return the rows of a method that need not be made again: made as now, and not failed."""
-        made = (row for row in self._rows if (row["method"], row["identity"]) == (label, identity))
-        return {row["name"]: row for row in made if row["status"] != "failed"}
-
-    def add(self, row: Row) -> None:
-        """Keep a row."""
-        with self._lock, self.path.open("a") as file:
-            file.write(json.dumps(row) + "\n")

@@ -30,6 +30,7 @@ class Question:
         before: Of the preceding frame of its sequence; None where there is none.
         exposure: At which it is judged.
         metrics: Names of `SCORES`.
+        reference: Whether it has a reference.
     """
 
     images: str
@@ -38,6 +39,7 @@ class Question:
     before: str | None
     exposure: float
     metrics: tuple[str, ...]
+    reference: bool = True
 
 
 def question_of(setting: Setting, method: Method, row: Mapping[str, Any]) -> Question:
@@ -48,8 +50,9 @@ def question_of(setting: Setting, method: Method, row: Mapping[str, Any]) -> Que
         method.folder,
         name,
         setting.names[name],
-        row["exposure"],
+        setting.exposures.get(name, row["exposure"]),
         setting.metrics,
+        row["reference"],
     )
 
 
@@ -64,7 +67,7 @@ def score(question: Question) -> dict[str, float]:
     root = Path(question.images)
     empty = dict.fromkeys(question.metrics, math.nan)
     target = root / REFERENCE / f"{question.name}.exr"
-    if not target.is_file():
+    if not question.reference:
         return empty
     output = load(root / question.folder / f"{question.name}.exr") * question.exposure
     reference = load(target) * question.exposure

@@ -133,8 +133,15 @@ class Scored:
         return self._having[scene, spp]
 
     def average(self, method: str, metric: str, spp: int | None = None) -> Cell:
-        """Return the mean over the scenes."""
-        scenes = [s for s in self.scenes if any(len(self._chosen(m, s, spp)) for m in self.methods)]
+        """Return the mean over the scenes; of one sample count, over those that have all counts.
+
+        Other scenes at each count would make of their differences one of the counts. Where no scene has all,
+        those that have the count are taken.
+        """
+        scenes = self.scenes
+        if spp is not None:
+            every = [s for s in self.scenes if self.counts_of(s) == self.counts]
+            scenes = every or [s for s in self.scenes if spp in self.counts_of(s)]
         cells = [self.cell(method, metric, scene, spp) for scene in scenes]
         return average_of(cells, SCORES[metric].digits)
 
@@ -147,7 +154,8 @@ class Scored:
     def by_spp(self, metric: str) -> Table:
         """Return one row per number of samples, one column per method."""
         rows = [(f"{n} spp", [self.average(m, metric, n) for m in self.methods]) for n in self.counts]
-        return self._table(f"spp_{metric}", f"{metric} per samples per pixel", "samples", metric, rows)
+        title = f"{metric} per samples per pixel, of the scenes that have all of these"
+        return self._table(f"spp_{metric}", title, "samples", metric, rows)
 
     def _table(
         self, name: str, title: str, corner: str, metric: str, rows: Iterable[tuple[str, list[Cell]]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -13,6 +15,7 @@ from urllib.parse import urlsplit
 import pandas as pd
 
 from trainer.evaluation.champion import version_of
+from trainer.evaluation.keeping import id_of
 from trainer.evaluation.plan import INPUT
 from trainer.evaluation.running import Outcome
 from trainer.evaluation.tables import AVERAGE, Scored
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 
 EXPERIMENT = "evaluations"
 PARENT, CHILD = "mlflow.parentRunId", "penumbra.method"
+EVALUATION, CONTENT = "penumbra.evaluation", "penumbra.content"
+"""Tags that name an evaluation, and what a method's run holds."""
 FILES = ("evaluation.json", "rows.parquet", "rows.csv", "report.html")
 FOLDERS = ("tables", "plots", "pictures")
 NOTE_LENGTH = 7000
@@ -87,21 +92,45 @@ def track(
     store = tracking_uri(uri)
     client = open_client(store)
     experiment = experiment_id(client, store, EXPERIMENT)
-    parent = _run(client, experiment, folder.resolve().name, {"penumbra.evaluation": str(folder.resolve())})
+    parent = _evaluation_run(client, experiment, folder)
     scored = Scored(rows, [outcome.method.label for outcome in outcomes], metrics)
     _log(client, parent, _about(rows), {})
     found = {"": parent}
+    before = _children(client, experiment, parent)
     for outcome in outcomes:
         label = outcome.method.label
-        tags = {PARENT: parent, CHILD: label, "penumbra.status": outcome.status}
+        params, values = _params(outcome), _means(scored, label)
+        content = hashlib.sha256(json.dumps([outcome.status, params, values]).encode()).hexdigest()
+        tags = {PARENT: parent, CHILD: label, CONTENT: content, "penumbra.status": outcome.status}
         if told := outcome.told():
             tags["penumbra.reason"] = told[:5000]
         if trained := training_run(outcome.method.model, store):
             tags["penumbra.training_run"] = trained[1]
-        found[label] = child = _run(client, experiment, label, tags)
-        _log(client, child, _params(outcome), _means(scored, label))
+        child = before.get((label, content))
+        if child is None:
+            child = str(client.create_run(experiment, run_name=label, tags=tags).info.run_id)
+            _log(client, child, params, values)
+        found[label] = child
         client.set_terminated(child, "FINISHED" if outcome.status == "done" else "FAILED")
+    for run in set(before.values()) - set(found.values()):
+        client.delete_run(run)  # of methods that were taken out, or whose results are others now
     return Tracked(store, experiment, found)
+
+
+def _evaluation_run(client: MlflowClient, experiment: str, folder: Path) -> str:
+    """Return the run of the evaluation in a folder, made if there is none."""
+    told = f"tags.`{EVALUATION}` = '{id_of(folder)}'"
+    there = client.search_runs([experiment], told, max_results=1)
+    if there:
+        return str(there[0].info.run_id)
+    tags = {EVALUATION: id_of(folder), "penumbra.folder": str(folder.resolve())[:5000]}
+    return str(client.create_run(experiment, run_name=folder.resolve().name, tags=tags).info.run_id)
+
+
+def _children(client: MlflowClient, experiment: str, parent: str) -> dict[tuple[str, str], str]:
+    """Return label and content → identifier of the runs of methods."""
+    runs = client.search_runs([experiment], f"tags.`{PARENT}` = '{parent}'", max_results=BATCH)
+    return {(run.data.tags.get(CHILD, ""), run.data.tags.get(CONTENT, "")): run.info.run_id for run in runs}
 
 
 def keep_files(tracked: Tracked, folder: Path) -> None:
@@ -164,24 +193,6 @@ def training_url(model: str, store: str) -> str | None:
     return page_of(found[0], experiment, found[1])
 
 
-def _run(client: MlflowClient, experiment: str, name: str, tags: Mapping[str, str]) -> str:
-    """Return the run with these tags, made if there is none."""
-    key = CHILD if CHILD in tags else "penumbra.evaluation"
-    told = [f"tags.`{key}` = '{_quoted(tags[key])}'"]
-    if PARENT in tags:
-        told.append(f"tags.`{PARENT}` = '{tags[PARENT]}'")
-    there = client.search_runs([experiment], " and ".join(told), max_results=1)
-    if not there:
-        return str(client.create_run(experiment, run_name=name, tags=dict(tags)).info.run_id)
-    for tag, value in tags.items():
-        client.set_tag(there[0].info.run_id, tag, value)
-    return str(there[0].info.run_id)
-
-
-def _quoted(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("'", "\\'")
-
-
 def _about(rows: pd.DataFrame) -> dict[str, str]:
     frames = rows[rows["method"] == INPUT]
     scenes = ", ".join(dict.fromkeys(frames["scene"].dropna().astype(str)))
@@ -207,8 +218,13 @@ def _means(scored: Scored, label: str) -> dict[str, float]:
         cells |= {scene: scored.cell(label, metric, scene) for scene in scored.scenes}
         for place, cell in cells.items():
             if cell.count and math.isfinite(cell.mean):
-                values[metric if place == AVERAGE else f"{metric}/{place}"] = cell.mean
+                values[metric if place == AVERAGE else f"{metric}/{_plain(place)}"] = cell.mean
     return values
+
+
+def _plain(name: str) -> str:
+    """Return a name with those letters only that names of metrics may have."""
+    return re.sub(r"[^/\w.\- :]", "_", name)[:200]
 
 
 def _log(client: MlflowClient, run: str, params: Mapping[str, str], values: Mapping[str, float]) -> None:

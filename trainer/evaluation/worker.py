@@ -7,12 +7,14 @@ so that a row means a picture.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import metadata
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TextIO
@@ -21,11 +23,16 @@ import numpy as np
 
 from data.exr_image import write_exr
 from data.frame import Frame, Image
+from data.manifest import file_sha256
 from trainer.clips import Clip, Item
 from trainer.denoising import ClipDenoiser, Result, Settings
 from trainer.evaluation.plan import INPUT, PLACES, REFERENCE, Method, Setting, clips_of
+from trainer.inputs import replaced_pixels
 from trainer.loading import Loaded, resolve
 from trainer.outputs import replacing
+
+PACKAGES = ("penumbra-denoise", "torch", "onnxruntime", "numba", "pyoidn")
+"""Whose releases results depend on."""
 
 
 @dataclass(frozen=True)
@@ -134,12 +141,11 @@ class Worker:
                     self.tell(row={"name": one.name, "status": "failed", "reason": reason})
                 denoiser, previous, spent = denoiser_of(loaded, clip, settings, self), None, 0.0
                 continue
-            if self.task.folder == INPUT:
-                self.known(item, frame, previous)
+            known = self.known(item, frame, previous) if self.task.folder == INPUT else {}
             previous = frame
             for done, result in results:
                 waiting = [one for one in waiting if one.name != done.name]
-                self.row(done, result, spent / len(results))
+                self.row(done, result, spent / len(results), known)
                 spent = 0.0
 
     def results(
@@ -150,8 +156,8 @@ class Worker:
         if item is clip.items[-1]:
             yield from denoiser.finish()
 
-    def row(self, item: Item, result: Result, seconds: float) -> None:
-        """Write a result and tell of it."""
+    def row(self, item: Item, result: Result, seconds: float, known: dict[str, Any]) -> None:
+        """Write a result and tell of it, and what else is known of the frame."""
         image, frame = result.frame.buffers["color"], result.frame
         write_image(self.images / self.task.folder / f"{item.name}.exr", image)
         bad = int((~np.isfinite(image).all(-1)).sum())
@@ -168,25 +174,35 @@ class Worker:
             "nonfinite": bad,
             "status": "nonfinite" if bad else "done",
             "reason": f"{bad} pixel{'s are' if bad > 1 else ' is'} NaN or Inf" if bad else None,
+            **known,
         }
         self.tell(row=row)
 
-    def known(self, item: Item, frame: Frame, previous: Frame | None) -> None:
-        """Write what is the same for all methods: the reference, and where pixels were before."""
+    def known(self, item: Item, frame: Frame, previous: Frame | None) -> dict[str, Any]:
+        """Write what is the same for all methods: the reference, and where pixels were before.
+
+        Returns:
+            Whether places were written, and how many pixels of the reference are not what its file holds.
+        """
+        repaired = int(frame.notes.get("repaired", {}).get("reference", 0))
+        facts: dict[str, Any] = {"places": False, "repaired": repaired}
+        if replaced := replaced_pixels(frame):
+            self.say(f"{frame.label}: {replaced}", "warning")
         if "reference" in frame.buffers:
             write_image(self.images / REFERENCE / f"{item.name}.exr", frame.buffers["reference"])
         if previous is None or (previous.scene, previous.index + 1) != (frame.scene, frame.index):
-            return
+            return facts
         from trainer.metrics.temporal import places_before
 
         try:
             places = places_before(frame, previous)
         except ValueError:
-            return  # nothing says where its pixels were: no temporal metrics
+            return facts  # nothing says where its pixels were: no temporal metrics
         target = self.images / PLACES / f"{item.name}.npz"
         target.parent.mkdir(parents=True, exist_ok=True)
         with replacing(target) as temporary:
             np.savez_compressed(temporary, places=places)
+        return facts | {"places": True}
 
 
 def parts(clip: Clip) -> list[Clip]:
@@ -218,11 +234,28 @@ def facts_of(loaded: Loaded) -> dict[str, Any]:
         }
     return {
         **facts,
+        "code": _code(model),
+        "versions": {name: _version(name) for name in PACKAGES},
         "class": type(model).__name__ if isinstance(model, Denoiser) else model.description.model,
         "inputs": list(model.inputs),
         "options": source.init_args,
         "sha256": source.sha256,
     }
+
+
+def _code(model: Any) -> str:
+    """Return the hash of the file that a model's class is written in, empty where there is none."""
+    try:
+        return file_sha256(Path(inspect.getfile(type(model))))
+    except (TypeError, OSError):
+        return ""
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def serve(task: Task, link: Connection, log: str, environment: dict[str, str]) -> None:

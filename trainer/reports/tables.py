@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import sys
 import textwrap
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from trainer.metrics.collection import METRICS, SOURCES
+
+if TYPE_CHECKING:
+    from trainer.evaluation import cells
 
 TITLES = {"test": "Held-out scenes, whole frames", "val": "Validation crops"}
 
@@ -62,3 +69,30 @@ def print_scores(logged: Mapping[str, Any], prefix: str) -> None:
     for source, definition in SOURCES.items():
         console.print(scores_table(logged, prefix, source))
         print(textwrap.fill(f"Definitions: {definition}", 100))
+
+
+def print_overviews(tables: Sequence[cells.Table]) -> None:
+    """Print tables of an evaluation; a pipe that is closed or lacks letters stops nothing."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    console = Console()
+    narrow = console.is_terminal
+    if not narrow:  # whoever reads the lines wants to find names in them
+        console = Console(width=160)
+    with suppress(BrokenPipeError):
+        for table in tables:
+            console.print(_overview(table, console.width, narrow))
+
+
+def _overview(table: cells.Table, width: int, narrow: bool) -> Table:
+    """Return a table in which the best is bold and the second underlined; long headings may be broken."""
+    shown = Table(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown.min_width = min(width, len(table.title))
+    shown.add_column(escape(table.corner))
+    for column in table.columns:
+        shown.add_column(escape(column.replace("_", "_\u200b") if narrow else column), justify="right")
+    styles = {1: "bold", 2: "underline"}
+    for head, row in table.rows:
+        texts = [(escape(cell.text()), styles.get(cell.rank)) for cell in row]
+        shown.add_row(escape(head), *(f"[{style}]{text}[/]" if style else text for text, style in texts))
+    return shown

@@ -38,6 +38,12 @@ def test_errors_are_better_when_lower():
     assert not decide(scored([0.2, 0.1], [0.1, 0.12], "flip_hdr"), VERSIONS, "1", "flip_hdr", 0.0).moves
 
 
+def test_a_champion_that_is_equalled_stays():
+    for one, other in (VERSIONS, VERSIONS[::-1]):
+        decision = decide(scored([20, 30], [20, 30]), [one, other], "1", "psnr_wskp", 0.01)
+        assert (decision.version, decision.moves) == ("1", False)
+
+
 def test_the_first_champion_is_the_best_one():
     decision = decide(scored([20, 30], [25, 29.5]), VERSIONS, None, "psnr_wskp", 0.0)
     assert (decision.moves, decision.version) == (True, "2")

@@ -5,6 +5,7 @@ import pickle
 import sys
 
 import numpy as np
+import OpenEXR
 import pandas as pd
 import pytest
 import torch
@@ -98,7 +99,7 @@ def test_rows_tables_and_pictures_are_written(monkeypatch, frames, tmp_path, cap
     record = json.loads((output / "evaluation.json").read_text())
     assert [m["status"] for m in record["methods"]] == ["done", "done"]
     assert [m["name"] for m in record["metrics"]] == ["psnr_wskp", "smape_wskp"]
-    assert "1 frames have no reference" in capsys.readouterr().err
+    assert "1 frame has no reference" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -109,7 +110,8 @@ def test_what_fails_is_said_and_the_others_finish(monkeypatch, frames, tmp_path,
         for name in ("Dies", "Greedy", "Holes", "Halved")
         for part in ("--model", f"{name}={HERE}.{name}")
     ]
-    arguments = (*models, "--model", "gone.ckpt", "--metric", "psnr_wskp")
+    (tmp_path / "torn.ckpt").write_bytes(b"PK")
+    arguments = (*models, "--model", f"torn={tmp_path / 'torn.ckpt'}", "--metric", "psnr_wskp")
     assert evaluate(monkeypatch, frames, output, *arguments) == 0
     record = json.loads((output / "evaluation.json").read_text())
     told = {m["label"]: (m["status"], m["reason"]) for m in record["methods"]}
@@ -118,8 +120,8 @@ def test_what_fails_is_said_and_the_others_finish(monkeypatch, frames, tmp_path,
     assert "ended with 9" in told["Dies"][1]
     assert told["Greedy"][0] == "skipped"
     assert "specular" in told["Greedy"][1]
-    assert told["gone.ckpt"][0] == "skipped"
-    assert "no such file" in told["gone.ckpt"][1]
+    assert told["torn"][0] == "skipped"
+    assert "torn.ckpt" in told["torn"][1]
     rows = pd.read_csv(output / "rows.csv").set_index(["method", "name"])
     holes = rows.loc["Holes"]
     assert set(holes["status"]) == {"done", "nonfinite"}
@@ -128,6 +130,42 @@ def test_what_fails_is_said_and_the_others_finish(monkeypatch, frames, tmp_path,
     assert rows.loc[("Dies", "f2"), "status"] == "failed"
     assert evaluate(monkeypatch, frames, output, *arguments, "--strict") == 1
     assert "specular" in capsys.readouterr().err
+
+
+class FailsFirst(Noisy):
+    """Returns the input, but fails at the brightest frame."""
+
+    def forward(self, buffers):
+        if float(buffers["color"].mean()) > 20:
+            raise ValueError("too bright")
+        return Denoised(buffers["color"])
+
+
+def test_one_frame_that_fails_changes_nothing_for_the_others(monkeypatch, tmp_path, capsys):
+    """Its sequence has one exposure, chosen by its first frame, which is the one that fails."""
+    folder = tmp_path / "frames"
+    for index in range(3):
+        made = split_buffers(1, *SIZE, seed=index)
+        names = ["color", "albedo", "normal", "reference"]
+        buffers = {n: np.ascontiguousarray(made[n][0].permute(1, 2, 0).numpy()) for n in names}
+        if index == 0:
+            buffers["color"] = buffers["color"] * 100
+        write_frame(Frame(buffers, "room", index), folder / f"f{index}.exr", single=True)
+    with OpenEXR.File(str(folder / "f1.exr"), separate_channels=True) as file:
+        file.parts[0].channels["reference.R"].pixels[2, 3:5] = np.nan
+        file.write(str(folder / "f1.exr"))
+    output = tmp_path / "out"
+    models = ("--model", f"first={HERE}.FailsFirst", "--metric", "psnr_wskp", "--no-costs")
+    assert evaluate(monkeypatch, folder, output, *models) == 0
+    rows = pd.read_parquet(output / "rows.parquet").set_index(["method", "name"])
+    assert list(rows.loc["first"]["status"]) == ["failed", "done", "done"]
+    for name in ("f1", "f2"):
+        for column in ("exposure", "psnr_wskp"):
+            assert rows.loc[("first", name), column] == rows.loc[("input", name), column]
+    assert list(rows.loc["input"]["repaired"]) == [0, 2, 0]
+    said = capsys.readouterr().err
+    assert "1 of 3 frames: " in said
+    assert "1 references have NaN or Inf pixels" in said
 
 
 @pytest.mark.slow

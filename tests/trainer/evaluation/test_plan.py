@@ -31,6 +31,24 @@ def test_equal_names_are_told_apart_and_folders_are_safe():
     assert all(folder.replace("-", "").replace(".", "").isalnum() for folder in folders)
 
 
+def test_a_folder_follows_from_its_label_alone():
+    """Results of an earlier command must not appear under the name of another method."""
+    labels = ["ours+", "ours", "Метод", "Сеть", "a b", "a-b", "x" * 70, "x" * 71, "Input", "..", "-"]
+    one = {m.label: m.folder for m in methods_of([(f"{label}=NLM", ()) for label in labels])}
+    other = {m.label: m.folder for m in methods_of([(f"{label}=NLM", ()) for label in reversed(labels)])}
+    assert one == other
+    assert len({folder.lower() for folder in one.values()} | {"input", "reference"}) == len(labels) + 2
+    assert one["ours"] == "ours"
+    assert one["a-b"] == "a-b"
+
+
+def test_an_existing_file_is_no_label(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "epoch=3-step=100.ckpt").write_bytes(b"")
+    (method,) = methods_of([("epoch=3-step=100.ckpt", ())])
+    assert method.model == "epoch=3-step=100.ckpt"
+
+
 @pytest.mark.parametrize("label", ["input", "reference"])
 def test_names_of_other_columns_are_refused(label):
     with pytest.raises(ValueError, match=label):

@@ -100,6 +100,27 @@ def test_there_is_a_table_per_samples_per_pixel_only_where_they_differ():
     assert [(head, cells[0].mean) for head, cells in table.rows] == [("4 spp", 20.0), ("32 spp", 30.0)]
 
 
+def test_only_scenes_with_all_counts_are_compared_over_samples():
+    parts = [({("a", "easy"): [30.0], ("a", "hard"): [20.0]}, 4), ({("a", "hard"): [24.0]}, 64)]
+    made = pd.concat([rows(values, spp=spp) for values, spp in parts], ignore_index=True)
+    made["name"] = [f"{scene}/{spp}" for scene, spp in zip(made["scene"], made["spp"], strict=True)]
+    table = Scored(made, ["a"], ["psnr_wskp"]).by_spp("psnr_wskp")
+    assert [(head, cells[0].mean) for head, cells in table.rows] == [("4 spp", 20.0), ("64 spp", 24.0)]
+
+
+def test_small_errors_are_told_apart():
+    made = rows({("a", "s"): [1.4e-5], ("b", "s"): [3.6e-5]}, "relmse_rousselle")
+    first, second = Scored(made, ["a", "b"], ["relmse_rousselle"]).by_scene("relmse_rousselle").rows[0][1]
+    assert (first.rank, second.rank) == (1, 2)
+    assert (first.text(), second.text()) == ("1.4e-05", "3.6e-05")
+
+
+def test_latex_has_no_letter_with_a_meaning_left():
+    name = "a^2 ~ {x} $5 \\n"
+    latex = Scored(rows({(name, "s"): [20.0]}), [name], ["psnr_wskp"]).by_scene("psnr_wskp").latex()
+    assert r"a\textasciicircum{}2 \textasciitilde{} \{x\} \$5 \textbackslash{}n" in latex
+
+
 def test_frames_without_reference_are_in_no_table():
     made = rows({("a", "s"): [20.0]})
     made.loc[1] = {**made.loc[0], "scene": "t", "name": "t/f000", "reference": False, "psnr_wskp": math.nan}

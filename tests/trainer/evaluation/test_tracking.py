@@ -8,8 +8,12 @@ import pytest
 from PIL import Image
 
 from tests.trainer.evaluation.test_evaluate import HERE, frames  # noqa: F401  # a fixture
+from tests.trainer.evaluation.test_tables import rows
 from trainer.cli import main
-from trainer.evaluation.tracking import page_of, training_run, training_url
+from trainer.evaluation.keeping import take_folder
+from trainer.evaluation.plan import Method
+from trainer.evaluation.running import Outcome
+from trainer.evaluation.tracking import page_of, track, training_run, training_url
 from trainer.runs import RunRecord
 from trainer.spool.store import open_client
 
@@ -70,6 +74,44 @@ def test_an_evaluation_that_is_run_again_has_the_same_runs(evaluated):
     before = {run.info.run_id for run in runs_of(client)}
     assert main() == 0
     assert {run.info.run_id for run in runs_of(client)} == before
+
+
+def outcome(label, model, status="done"):
+    done = Outcome(Method(label, model, folder=label))
+    done.facts = {"class": model}
+    done.rows = {"s/f000": {"status": status, "reason": None if status == "done" else "it broke"}}
+    return done
+
+
+def tracked(folder, uri, *outcomes, value=20.0, scene="s"):
+    take_folder(folder, "these", "frames")
+    made = rows({(o.method.label, scene): [value] for o in outcomes})
+    return track(folder, outcomes, made, ["psnr_wskp"], uri)
+
+
+def test_a_method_that_is_another_now_has_another_run_and_old_numbers_are_gone(tmp_path):
+    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
+    first = tracked(tmp_path / "out", uri, outcome("x", "Half"), outcome("y", "Third"))
+    again = tracked(tmp_path / "out", uri, outcome("x", "Quarter"), value=8.0)
+    runs = {run.info.run_name: run for run in runs_of(open_client(uri))}
+    assert set(runs) == {"out", "x"}
+    assert (runs["x"].data.params["model"], runs["x"].data.metrics["psnr_wskp"]) == ("Quarter", 8.0)
+    assert first.runs["x"] != again.runs["x"]
+    assert first.runs[""] == again.runs[""]
+
+
+def test_two_evaluations_in_folders_of_one_name_have_runs_of_their_own(tmp_path):
+    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
+    one = tracked(tmp_path / "out", uri, outcome("x", "Half"))
+    (tmp_path / "out").rename(tmp_path / "elsewhere")  # as another container has it
+    other = tracked(tmp_path / "out", uri, outcome("x", "Half"))
+    assert not set(one.runs.values()) & set(other.runs.values())
+
+
+def test_names_of_scenes_may_have_any_letters(tmp_path):
+    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
+    run = tracked(tmp_path / "out", uri, outcome("x", "Half"), scene="Küche (v2), 50%").runs["x"]
+    assert open_client(uri).get_run(run).data.metrics["psnr_wskp/Küche _v2__ 50_"] == 20.0
 
 
 def test_a_store_that_cannot_be_used_is_told_and_loses_nothing(evaluated, monkeypatch, capsys):

@@ -95,7 +95,12 @@ function paintCrop(area, column, kind, box, label) {
 function captionOf(column) {
   const scores = facts.scores[columns[column].label], first = metrics.findIndex((m) => m.name === $("plot-metric").value);
   const value = scores?.[state.frame]?.[first];
-  return columns[column].kind === "reference" ? "reference" : value === undefined || first < 0 ? "" : `${metrics[first].name} ${value === null ? "–" : fixedTo(value, metrics[first].decimals)}`;
+  return columns[column].kind === "reference" ? "reference" : value === undefined || first < 0 ? "" : `${metrics[first].name} ${value === null ? "–" : printed(value, metrics[first].digits)}`;
 }
 
-const fixedTo = (value, decimals) => (typeof value === "string" ? value : value.toFixed(decimals).replace("-", "−"));
+// As Python's formats "4f" and "4g" do.
+function printed(value, digits) {
+  if (typeof value === "string") return value;
+  const count = parseInt(digits), text = digits.endsWith("g") ? String(Number(value.toPrecision(count))) : value.toFixed(count);
+  return text.replace("-", "−");
+}

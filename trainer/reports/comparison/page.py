@@ -131,7 +131,7 @@ def _metric(metric: Mapping[str, Any]) -> dict[str, Any]:
         "name": metric["name"],
         "higher": bool(metric["higher"]),
         "definition": metric.get("definition", ""),
-        "decimals": len(SCORES[metric["name"]].format.format(0.0).split()[0].partition(".")[2]),
+        "digits": SCORES[metric["name"]].digits.removeprefix("{:.").removesuffix("}"),
     }
 
 
@@ -163,8 +163,7 @@ def _scores(
     found = {}
     for label in methods:
         own = rows[rows["method"] == label]
-        own = own.set_index(own["scene"].astype(str) + "/" + own["frame"].astype(str))
-        own = own[~own.index.duplicated()].reindex([f"{f['scene']}/{f['index']}" for f in frames])
+        own = own.set_index("name").reindex([f["name"] for f in frames])
         found[label] = [[_plain(value) for value in own[name]] for name in names]
     return found
 
@@ -181,7 +180,8 @@ def _table(table: Table) -> dict[str, Any]:
 
 
 def _cell(cell: Cell) -> list[Any]:
-    return [_plain(cell.mean), _plain(cell.half), cell.rank, cell.text(), cell.interval(), cell.count]
+    half, rank = _plain(cell.half), cell.rank
+    return [_plain(cell.mean), half, rank, cell.text(), cell.interval(), cell.count, cell.missing]
 
 
 def _plain(value: Any) -> float | None:

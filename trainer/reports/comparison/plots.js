@@ -71,7 +71,7 @@ function convergence(metric) {
   if (!table) return null;
   const counts = table.rows.map(([head]) => parseFloat(head));
   const lines = table.columns.map((label, c) => ({
-    label, points: table.rows.map(([, cells], i) => ({ x: counts[i], y: cells[c][0], half: cells[c][1] ?? 0 })).filter((p) => typeof p.y === "number"),
+    label, points: table.rows.map(([, cells], i) => ({ x: counts[i], y: cells[c][0], half: cells[c][1] ?? 0 })).filter((p, i) => typeof p.y === "number" && !table.rows[i][1][c][6]),
   })).filter((line) => line.points.length);
   const values = lines.flatMap((l) => l.points.map((p) => p.y));
   if (!values.length) return null;
@@ -125,8 +125,8 @@ function timeAgainstQuality(metric, scene) {
   if (!cells) return null;
   const points = methods.map((m) => {
     const cell = cells[table.columns.indexOf(m.label)];
-    return { label: m.label, x: m.cost?.seconds_per_megapixel ?? m.seconds, y: cell?.[0], half: cell?.[1] ?? 0 };
-  }).filter((p) => p.x > 0 && typeof p.y === "number");
+    return { label: m.label, x: m.cost?.seconds_per_megapixel ?? m.seconds, y: cell?.[0], half: cell?.[1] ?? 0, missing: cell?.[6] };
+  }).filter((p) => p.x > 0 && typeof p.y === "number" && !p.missing); // means of fewer frames cannot be compared
   if (!points.length) return null;
   const values = points.map((p) => p.y), logarithmic = wide(metric, values);
   const reach = logarithmic ? values : points.flatMap((p) => [p.y - p.half, p.y + p.half]);
