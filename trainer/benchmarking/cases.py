@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 KINDS = ("inference", "training")
@@ -41,6 +43,13 @@ class Method:
     def format(self) -> str | None:
         """The format of an exported file, None for every other model."""
         return next((mode for suffix, mode in EXPORTED.items() if self.model.endswith(suffix)), None)
+
+    @property
+    def is_class(self) -> bool:
+        """Whether a class is named, not a file, a folder or a registered model."""
+        file = self.model.endswith((".ckpt", ".pt", ".pth", *EXPORTED))
+        named = re.fullmatch(r"[A-Za-z_][\w.]*", self.model) is not None
+        return named and not file and not Path(self.model).exists()
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from trainer.benchmarking.cases import Outcome
 from trainer.benchmarking.pairing import Comparison
 from trainer.benchmarking.plots import MEMORY_USE, TIME, plot
-from trainer.outputs import write_whole
+from trainer.outputs import replacing
 
 NAMES = ("benchmark.json", "time.svg", "memory.svg")
 
@@ -21,26 +22,54 @@ def paths(folder: Path) -> list[Path]:
     return [folder / name for name in NAMES]
 
 
-def write(
-    folder: Path, machine: dict[str, Any], outcomes: Sequence[Outcome], comparisons: Sequence[Comparison]
-) -> list[Path]:
-    """Write everything and return what was written.
+@dataclass(frozen=True)
+class Results:
+    """The files of one run.
 
-    Raises:
-        OSError: Nothing can be written there.
+    Attributes:
+        folder: Where they are; None: nothing is written.
+        machine: From `trainer.benchmarking.machine.describe`.
     """
-    figures, time, memory = paths(folder)
-    content = {
-        "penumbra": machine["versions"]["penumbra-denoise"],
-        "created": machine["time"],
-        "command": ["trainer", *sys.argv[1:]],
-        "machine": machine,
-        "cases": [outcome.row() for outcome in outcomes],
-        "comparisons": [comparison.row() for comparison in comparisons],
-    }
-    write_whole(figures, json.dumps(content, indent=1) + "\n")
-    if not any(outcome.done for outcome in outcomes):
+
+    folder: Path | None
+    machine: dict[str, Any]
+
+    def keep(self, outcomes: Sequence[Outcome], comparisons: Sequence[Comparison]) -> list[Path]:
+        """Write all figures so far, in place of those before, and return what was written.
+
+        Raises:
+            OSError: Nothing can be written there.
+        """
+        if self.folder is None:
+            return []
+        figures, *plots = paths(self.folder)
+        content = {
+            "penumbra": self.machine["versions"]["penumbra-denoise"],
+            "created": self.machine["time"],
+            "command": ["trainer", *sys.argv[1:]],
+            "machine": self.machine,
+            "cases": [outcome.row() for outcome in outcomes],
+            "comparisons": [comparison.row() for comparison in comparisons],
+        }
+        _write(figures, json.dumps(content, indent=1) + "\n")
+        for path in plots:  # of a run that this one replaces
+            path.unlink(missing_ok=True)
         return [figures]
-    write_whole(time, plot(outcomes, TIME))
-    write_whole(memory, plot(outcomes, MEMORY_USE))
-    return [figures, time, memory]
+
+    def finish(self, outcomes: Sequence[Outcome], comparisons: Sequence[Comparison]) -> list[Path]:
+        """Write figures and plots, where there are any, and return what was written; raises as `keep`."""
+        if self.folder is None or not outcomes:
+            return []
+        written = self.keep(outcomes, comparisons)
+        if not any(outcome.done for outcome in outcomes):
+            return written
+        _, time, memory = paths(self.folder)
+        _write(time, plot(outcomes, TIME))
+        _write(memory, plot(outcomes, MEMORY_USE))
+        return [*written, time, memory]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a text whole, whatever the encoding of the surroundings is."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8", errors="replace")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from trainer.benchmarking.table import seconds_text
 if TYPE_CHECKING:
     from trainer.progress import FrameProgress
 
+Keep = Callable[[Sequence[Outcome], Sequence[Comparison]], object]
+
 
 @dataclass
 class Session:
@@ -24,6 +27,7 @@ class Session:
         progress: Counts cases or comparisons.
         effort: How long to measure each.
         processes: Pairs of processes of a comparison.
+        keep: Called with all that is done after every case or comparison, before it is told.
         outcomes: Of all cases that were measured, or failed.
         comparisons: All that were made.
     """
@@ -31,6 +35,7 @@ class Session:
     progress: FrameProgress
     effort: Effort
     processes: int = 5
+    keep: Keep = lambda outcomes, comparisons: None
     outcomes: list[Outcome] = field(default_factory=list)
     comparisons: list[Comparison] = field(default_factory=list)
 
@@ -41,7 +46,7 @@ class Session:
                 outcome = measure(case, self.effort, made, self._watcher(case.label))
                 self.outcomes.append(outcome)
                 said = seconds_text(outcome.median) if outcome.done else f"failed: {outcome.reason}"
-                self.progress.advance(f"{case.label}: {said}")
+                self._advance(f"{case.label}: {said}")
 
     def compare_models(self, pairs: Iterable[tuple[Case, Case]]) -> None:
         """Compare cases of two models."""
@@ -68,7 +73,23 @@ class Session:
         self.comparisons.append(comparison)
         self.outcomes += comparison.sides
         said = f"{comparison.ratio:.3f}" if comparison.done else "failed"
-        self.progress.advance(f"{label}: {said}")
+        self._advance(f"{label}: {said}")
+
+    def _advance(self, said: str) -> None:
+        self.keep(self.outcomes, self.comparisons)
+        with suppress(BrokenPipeError):  # nobody reads how far it is; figures are kept all the same
+            self.progress.advance(self._plain(said))
 
     def _watcher(self, label: str) -> Watcher:
-        return Watcher(lambda stage: self.progress.doing(f"{label}: {stage}"), self.progress.within)
+        def tell(stage: str) -> None:
+            self.progress.doing(self._plain(f"{label}: {stage}"))
+
+        return Watcher(tell, self.progress.within)
+
+    def _plain(self, text: str) -> str:
+        """Return what shows the text as it is: a bar reads brackets, as a path may hold, as markup."""
+        if self.progress.bar is None:
+            return text
+        from rich.markup import escape
+
+        return escape(text)

@@ -5,7 +5,6 @@ Images are made up with the ranges of renders (`trainer.export.entry.example`): 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -88,16 +87,11 @@ def load(method: Method, device: str) -> Model:
     Raises:
         ValueError, FileNotFoundError: There is no such model, or it is damaged.
     """
-    if not _is_class(method.model):
+    if not method.is_class:
         return resolve(method.model, device, options=method.options).model
     class_path = class_path_of(method.model)
     denoiser = build(class_path, parse(find_class(class_path), method.options))
     return denoiser.eval().requires_grad_(False).to(device)
-
-
-def _is_class(name: str) -> bool:
-    file = name.endswith((".ckpt", ".pt", ".pth", ".onnx", ".ts"))
-    return not file and re.fullmatch(r"[A-Za-z_][\w.]*", name) is not None and not Path(name).exists()
 
 
 def _check(model: Model, case: Case) -> None:

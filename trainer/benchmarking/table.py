@@ -68,15 +68,18 @@ def table(outcomes: Sequence[Outcome]) -> Table:
     """Return a row per case: median and quartiles of a call, time per megapixel, memory."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     columns = varied([outcome.case for outcome in outcomes])
-    shown = Table(title=shared_text([o.case for o in outcomes]), title_justify="left", box=box.SIMPLE_HEAD)
+    # Text, since a path may hold brackets, which are markup in a plain string.
+    title = Text(shared_text([o.case for o in outcomes]), style="table.title")
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for name in columns:
         shown.add_column(name, overflow="fold")
     for name in ("time", "quartiles", "per MP", "memory", "per MP"):
         shown.add_column(name, justify="right", no_wrap=True)
     for outcome in outcomes:
-        shown.add_row(*(outcome.case.settings[name] for name in columns), *_figures(outcome))
+        shown.add_row(*(Text(outcome.case.settings[name]) for name in columns), *_figures(outcome))
     return shown
 
 
@@ -107,19 +110,20 @@ def remarks(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def comparison_lines(comparison: Comparison) -> list[str]:
-    """Return what came of a comparison, in words."""
+    """Return what came of a comparison, in words; nothing where a side failed, which `remarks` tells."""
     one, other = comparison.names
-    lines = [f"{n}: {s.reason}" for n, s in zip(comparison.names, comparison.sides, strict=True) if s.reason]
+    if not all(side.done for side in comparison.sides):
+        return []
     if not comparison.done:
-        return lines or [f"{one}, {other}: stopped before three pairs of processes were measured"]
+        return [f"{one}, {other}: stopped before three pairs of processes were measured"]
     (low, high), ratio = comparison.interval, comparison.ratio
     verdict = "no significant difference"
     if comparison.significant:
         verdict = f"{other} is significantly {'faster' if ratio < 1 else 'slower'}"
-    lines.append(
+    lines = [
         f"{other} takes {ratio:.3f} times as long as {one} (95 % confidence {low:.3f} to {high:.3f}, "
         f"{len(comparison.ratios)} pairs of processes): {verdict}"
-    )
+    ]
     memory = [side.peak_bytes for side in comparison.sides]
     if all(memory):
         lines.append(f"and {memory[1] / memory[0]:.3f} times the memory")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from trainer.configs import UsageError
 from trainer.options import AddModel, AddOption
 
 if TYPE_CHECKING:
-    from trainer.benchmarking.cases import Method
+    from trainer.benchmarking.cases import Case, Method
     from trainer.benchmarking.session import Session
 
 HELP = "measure time and memory of denoisers, or compare two"
@@ -74,6 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_comparison(parser)
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder for benchmark.json and plots")
     parser.add_argument("--force", action="store_true", help="replace results that are already there")
+    parser.add_argument(
+        "--strict", action="store_true", help="exit with 1 if any case failed (default: only if all failed)"
+    )
 
 
 def _add_effort(parser: argparse.ArgumentParser) -> None:
@@ -130,12 +134,12 @@ def _add_comparison(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure everything, print and write it; returns the exit code.
+    """Measure everything, write it as it comes, and print it; returns the exit code.
 
     Raises:
-        UsageError: Options do not go together.
-        ValueError: There is no such revision, or results are already there.
-        OSError: The output cannot be written.
+        UsageError: Options do not go together, or a model does not take its own.
+        ValueError: There is no such class or revision, or results are already there.
+        OSError: There is no such model, or the output cannot be written.
     """
     from trainer.benchmarking import files, machine
     from trainer.benchmarking.cases import Effort, Method, cases_of
@@ -143,12 +147,37 @@ def run(args: argparse.Namespace) -> int:
     from trainer.outputs import make_folder, refuse_existing
     from trainer.progress import FrameProgress
 
-    methods = [Method(model, tuple(options)) for model, options in args.models]
+    methods = list(dict.fromkeys(Method(model, tuple(options)) for model, options in args.models))
     _check_together(args, methods)
+    _check_models(args, methods)
     if args.output is not None:
         refuse_existing(files.paths(args.output), args.force)
         make_folder(args.output)
-    about = machine.describe()
+    results = files.Results(args.output, machine.describe())
+    cases = cases_of(methods, _chosen(args), spp=args.spp, memory=args.memory)
+    unit = "comparison" if args.pair or args.revisions else "case"
+    repeat, seconds = (4, 60.0) if unit == "comparison" else (15, 20.0)
+    effort = Effort(args.repeat or repeat, args.warmup, args.seconds or seconds)
+    with FrameProgress(len(cases) // (1 + args.pair), title="measuring", unit=unit) as progress:
+        session = Session(progress, effort, args.processes, results.keep)
+        try:
+            interrupted = not _measured(args, session, cases)
+        finally:
+            written = results.finish(session.outcomes, session.comparisons)
+    if interrupted:
+        plural = "s" * (progress.total != 1)
+        print(f"interrupted: {progress.done} of {progress.total} {unit}{plural} measured", file=sys.stderr)
+    _print(results.machine, session)
+    if written:
+        print(f"written: {', '.join(map(str, written))}", file=sys.stderr)
+    if interrupted:
+        return INTERRUPTED
+    enough = all if args.strict else any
+    return 0 if session.outcomes and enough(outcome.done for outcome in session.outcomes) else 1
+
+
+def _chosen(args: argparse.Namespace) -> dict[str, list[Any]]:
+    """Return the settings that cases are made of, without repetitions."""
     chosen = {
         "kind": args.kind or ["inference"],
         "size": args.size,
@@ -157,42 +186,29 @@ def run(args: argparse.Namespace) -> int:
         "device": args.device or ["cpu"],
         "mode": args.mode or ["eager"],
     }
-    chosen = {name: list(dict.fromkeys(values or [])) for name, values in chosen.items()}
-    cases = cases_of(list(dict.fromkeys(methods)), chosen, spp=args.spp, memory=args.memory)
-    compared = args.pair or args.revisions
-    total = len(cases) // 2 if args.pair else len(cases)
-    unit = "comparison" if compared else "case"
-    repeat, seconds = (4, 60.0) if compared else (15, 20.0)
-    effort = Effort(args.repeat or repeat, args.warmup, args.seconds or seconds)
-    interrupted = False
-    with FrameProgress(total, title="measuring", unit=unit) as progress:
-        session = Session(progress, effort, args.processes)
-        try:
-            if args.pair:
-                session.compare_models(zip(cases[:total], cases[total:], strict=True))
-            elif args.revisions:
-                session.compare_revisions(cases, args.revisions)
-            else:
-                session.measure(cases)
-        except KeyboardInterrupt:
-            interrupted = True
-    if interrupted:
-        plural = "s" * (total != 1)
-        print(f"interrupted: {progress.done} of {total} {unit}{plural} measured", file=sys.stderr)
-    _print(about, session)
-    if args.output is not None and session.outcomes:
-        written = files.write(args.output, about, session.outcomes, session.comparisons)
-        print(f"written: {', '.join(map(str, written))}", file=sys.stderr)
-    if interrupted:
-        return INTERRUPTED
-    return 0 if any(outcome.done for outcome in session.outcomes) else 1
+    return {name: list(dict.fromkeys(values or [])) for name, values in chosen.items()}
+
+
+def _measured(args: argparse.Namespace, session: Session, cases: list[Case]) -> bool:
+    """Measure or compare; returns whether everything is done, not interrupted before."""
+    half = len(cases) // 2
+    try:
+        if args.pair:
+            session.compare_models(zip(cases[:half], cases[half:], strict=True))
+        elif args.revisions:
+            session.compare_revisions(cases, args.revisions)
+        else:
+            session.measure(cases)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 def _check_together(args: argparse.Namespace, methods: list[Method]) -> None:
     """Raise a UsageError where options do not go together."""
     if args.pair and args.revisions:
         raise UsageError("--pair compares two models and --revisions two revisions of one: use one of them")
-    if args.pair and (len(methods) != 2 or methods[0] == methods[1]):
+    if args.pair and len(methods) != 2:
         raise UsageError(f"--pair compares two models: expected two different --model, got {len(methods)}")
     if args.pair and {method.format for method in methods} != {None} and len(set(args.mode or [])) > 1:
         raise UsageError("--pair with an exported file, which has one mode: give at most one --mode")
@@ -200,6 +216,16 @@ def _check_together(args: argparse.Namespace, methods: list[Method]) -> None:
         raise UsageError(f"--revisions compares one model: expected one --model, got {len(methods)}")
     if args.revisions and args.revisions[0] == args.revisions[1]:
         raise UsageError(f"--revisions: expected two different revisions, got {args.revisions[0]} twice")
+
+
+def _check_models(args: argparse.Namespace, methods: list[Method]) -> None:
+    """Find mistyped models and options before anything is measured; raises as `check_named`."""
+    from trainer.loading import check_named
+
+    here = not args.revisions or "." in args.revisions
+    for method in methods:
+        if here or not method.is_class:  # other revisions may have other classes and options
+            check_named(method.model, method.options)
 
 
 def _print(about: dict[str, Any], session: Session) -> None:
@@ -210,6 +236,8 @@ def _print(about: dict[str, Any], session: Session) -> None:
 
     if not session.outcomes:
         return
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # not every encoding has – and µ
     console = Console(width=WIDTH if not sys.stdout.isatty() else min(Console().width, WIDTH))
     console.print(table(session.outcomes))
     lines = remarks(session.outcomes)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from trainer.metrics import functional, temporal
+from trainer.metrics import functional, lpips, temporal
 from trainer.metrics.flip import flip_hdr, flip_ldr_srgb
 
 
@@ -40,6 +40,8 @@ def _score(function: Callable[..., object], higher: bool, form: str, temporal: b
     return Score(None if temporal else function, higher, form, doc)  # type: ignore[arg-type]
 
 
+_NO_LPIPS = lpips.missing()
+
 SCORES: dict[str, Score] = {
     "psnr_wskp": _score(functional.psnr_wskp, True, "{:.2f} dB"),
     "ssim_wskp": _score(functional.ssim_wskp, True, "{:.4f}"),
@@ -62,12 +64,18 @@ SCORES: dict[str, Score] = {
     "ms_ssim_gamma": _score(functional.ms_ssim_gamma, True, "{:.4f}"),
     "flip_ldr_srgb": _score(flip_ldr_srgb, False, "{:.4f}"),
     "flip_hdr": _score(flip_hdr, False, "{:.4f}"),
+    **({} if _NO_LPIPS else {"lpips_alex_gamma": _score(lpips.lpips_alex_gamma, False, "{:.4f}")}),
     "change_gamma": _score(temporal.change_gamma, False, "{:.5f}", temporal=True),
     "flicker_gamma": _score(temporal.flicker_gamma, False, "{:.5f}", temporal=True),
 }
 """Name, which says definition and domain → the metric."""
 
-LEFT_OUT = {
-    "lpips": "LPIPS needs the weights of a classification network, which no package brings; it is left out."
-}
-"""Metrics that users look for and that are not taken → why."""
+LEFT_OUT: dict[str, str] = (
+    {
+        "lpips_alex_gamma": f"left out: {_NO_LPIPS}",
+        "lpips": f"taken as lpips_alex_gamma, which is left out: {_NO_LPIPS}",
+    }
+    if _NO_LPIPS
+    else {"lpips": "depends on the network and on the transfer to display values: see lpips_alex_gamma"}
+)
+"""Metrics that users look for and that are not taken under this name → why."""

@@ -9,7 +9,7 @@ from trainer.benchmarking import pairing
 from trainer.benchmarking.cases import Case, Effort, Method
 from trainer.benchmarking.measuring import Exports, Watcher
 from trainer.benchmarking.pairing import Contestant, compare, student_interval
-from trainer.benchmarking.table import comparison_lines
+from trainer.benchmarking.table import comparison_lines, remarks
 
 MADE = Exports(Path("unused"))
 
@@ -65,11 +65,12 @@ def test_the_interval_is_that_of_student():
     assert low == pytest.approx(1 / high)
 
 
-def test_where_one_fails_its_reason_is_told_and_there_is_no_ratio(stand):
+def test_where_one_fails_its_reason_is_told_once_and_there_is_no_ratio(stand):
     stand.failing |= {"B": "no CUDA device"}
     found = compared()
     assert not found.done
-    assert comparison_lines(found) == ["A: not without the other", "B: no CUDA device"]
+    told = remarks(found.sides) + comparison_lines(found)
+    assert told == ["A: not without the other", "B: no CUDA device"]
     assert "ratio" not in found.row()
 
 

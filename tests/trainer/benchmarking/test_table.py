@@ -39,6 +39,11 @@ def test_the_widest_table_fits_a_page_and_cuts_no_figure():
     assert "…" not in text
 
 
+@pytest.mark.parametrize("name", ["runs[/old]/best.ckpt", "[bold]WSKP", "runs/:smile:/best.ckpt"])
+def test_a_name_is_printed_as_it_is(name):
+    assert name in printed([outcome(name)])
+
+
 def test_a_failed_case_is_a_row_and_its_reason_follows():
     outcomes = [outcome(), failure("NFOR", "it reads sequences")]
     assert "failed" in printed(outcomes)
