@@ -13,6 +13,7 @@ from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
+from models.kp import KP
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
 from models.sbmc import SBMC
@@ -21,6 +22,7 @@ from models.wskp import WSKP
 __all__ = [
     "ACFM",
     "AFGSA",
+    "KP",
     "KPCN",
     "NFOR",
     "NLM",

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
-KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral", "SBMC", *LAYERS}
+KERNEL_METHODS = {"KP", "KPCN", "WSKP", "JointBilateral", "SBMC", *LAYERS}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
 CLEANING = {"ACFM", "AFGSA", "KPCN", "SBMC", *LAYERS}
