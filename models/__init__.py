@@ -18,6 +18,7 @@ from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
 from models.sbmc import SBMC
 from models.wskp import WSKP
+from models.wskp_mr import MultiResolutionWSKP
 
 __all__ = [
     "ACFM",
@@ -32,6 +33,7 @@ __all__ = [
     "JointBilateral",
     "JointNLM",
     "Layer",
+    "MultiResolutionWSKP",
     "MultiScaleNLM",
     "Optimized",
     "PixelGather",
