@@ -16,6 +16,7 @@ colour, no temporal accumulation. The layers are in a supplement that is not pub
 - the combining weight is a sigmoid of a channel of the head; the paper asks for a weight per pixel;
 - the coarsest result is the filtered image itself;
 - filmic curve: constants of the code of the authors of that data; `curve="gamma"` is that of `models.wskp`;
+- equation 7 gives negative radiance where a dark pixel has much brighter neighbours: it becomes 0;
 - images whose sides are no multiples of 32 are padded by repeating their last row and column;
 - `exposure` and constant depth: as in `models.wskp`.
 
@@ -121,7 +122,7 @@ class MultiResolutionWSKP(Denoiser):
             filtered = reconstruct(image, level.log_importance, level.fusion_logits, self.kernel_sizes)
             result = filtered if level.alpha is None else blended(filtered, result, level.alpha)
         height, width = buffers["albedo"].shape[-2:]
-        return Denoised(result[..., :height, :width] * buffers["albedo"])
+        return Denoised(result[..., :height, :width].clamp_min(0.0) * buffers["albedo"])
 
     def predict(self, buffers: Buffers) -> list[Level]:
         """Return what the network predicts, from fine to coarse, of images padded to multiples of 32.

@@ -9,6 +9,7 @@ import torch
 
 from models import MultiResolutionWSKP
 from models.blocks.average_unet import AverageUNet
+from models.ops.resolutions import blended
 from models.ops.tonemap import filmic, gamma
 from tests.models.frames import largest_relative, noisy_edges, random_buffers
 from tests.models.plain_wskp_mr import plain_heads, plain_wskp_mr, spread_out
@@ -64,7 +65,7 @@ def test_it_equals_the_literal_transcription(levels: int, resolutions: int, size
         torch.nn.init.uniform_(parameter, -0.4, 0.4)
     with torch.no_grad():
         found = network(buffers).color
-        expected = plain_wskp_mr(network.state_dict(), buffers, levels, resolutions, sizes)
+        expected = plain_wskp_mr(network.state_dict(), buffers, levels, resolutions, sizes).clamp_min(0)
     assert largest_relative(found, expected) < 1e-12
 
 
@@ -118,6 +119,25 @@ def test_the_network_sees_exposed_color_through_its_curve(name: Any, curve: Any)
     color = curve(0.5 * buffers["irradiance"] * buffers["albedo"])
     torch.testing.assert_close(seen[0][:, :3], color)
     torch.testing.assert_close(seen[0][:, 3:6], buffers["albedo"])
+
+
+def test_negative_radiance_of_equation_7_becomes_black(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(3)
+    network, buffers = MultiResolutionWSKP(8), random_buffers(1, 64, 64)
+    buffers["irradiance"][..., ::9, ::7] = 1e4
+    for parameter in network.parameters():
+        torch.nn.init.uniform_(parameter, -0.4, 0.4)
+    combined: list[torch.Tensor] = []
+
+    def recorded(*images: torch.Tensor) -> torch.Tensor:
+        combined.append(blended(*images))
+        return combined[-1]
+
+    monkeypatch.setattr("models.wskp_mr.blended", recorded)
+    with torch.no_grad():
+        found = network(buffers).color
+    assert (combined[-1] < 0).any()
+    assert torch.equal(found, combined[-1].clamp_min(0.0) * buffers["albedo"])
 
 
 def test_bfloat16_stays_near_float32() -> None:
