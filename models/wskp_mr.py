@@ -76,7 +76,7 @@ class MultiResolutionWSKP(Denoiser):
 
     inputs = ("irradiance", "albedo", "normal", "depth")
     frame_numbers = ("exposure", "depth_range")
-    bytes_per_pixel = 1500
+    bytes_per_pixel = 1200  # resident memory grows by 1000 at 1280x720
 
     def __init__(
         self,
