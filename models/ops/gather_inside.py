@@ -99,10 +99,12 @@ def gather_inside_rows(image: Tensor, logits: Tensor, size: int, first: int) -> 
     image, reach = wide(image), size // 2
     rows, height = logits.shape[-2], image.shape[-2]
     seen = image[..., max(0, first - reach) : first + rows + reach, :]
-    missing = (0, 0, max(0, reach - first), max(0, first + rows + reach - height))
-    both = F.pad(torch.cat([seen, torch.ones_like(seen[:, :1])], 1), missing)
+    missing = (max(0, reach - first), max(0, first + rows + reach - height))
+    if rows == height:  # then all rows count as they are, without a padded copy
+        missing = (0, 0)
+    both = _extended(torch.cat([seen, torch.ones_like(seen[:, :1])], 1), missing, 0.0)
     # Beside the largest logit, weights are shifted by 0 where the image is and by infinity elsewhere.
-    outside = F.pad(torch.zeros_like(seen[:, :1]), missing, value=torch.inf)
+    outside = _extended(torch.zeros_like(seen[:, :1]), missing, torch.inf)
     largest = _inside_maximum(logits.detach(), size, image.dtype, first, height)
     kernels = Kernels(logits[:, None], size, image.dtype, largest[:, None], outside)
     return _ratio(_gathered(both[:, None], kernels))
@@ -120,6 +122,11 @@ def _inside_maximum(logits: Tensor, size: int, dtype: torch.dtype, first: int, h
         part = out[:, 0, lines, columns]
         torch.maximum(part, logits[:, index, lines, columns].to(dtype), out=part)
     return out
+
+
+def _extended(image: Tensor, rows: tuple[int, int], value: float) -> Tensor:
+    """Return the image with so many rows more above and below."""
+    return F.pad(image, (0, 0, *rows), value=value) if any(rows) else image
 
 
 def _ratio(sums: Tensor) -> Tensor:
