@@ -13,14 +13,17 @@ from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
+from models.kp import KP
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
 from models.sbmc import SBMC
 from models.wskp import WSKP
+from models.wskp_mr import MultiResolutionWSKP
 
 __all__ = [
     "ACFM",
     "AFGSA",
+    "KP",
     "KPCN",
     "NFOR",
     "NLM",
@@ -30,6 +33,7 @@ __all__ = [
     "JointBilateral",
     "JointNLM",
     "Layer",
+    "MultiResolutionWSKP",
     "MultiScaleNLM",
     "Optimized",
     "PixelGather",

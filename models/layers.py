@@ -55,10 +55,11 @@ from models.blocks.pointwise import Pointwise
 from models.blocks.unet import UNet, Upsampling, enlarged
 from models.denoiser import Buffers, Denoised
 from models.ops.boxes import exporting
+from models.ops.gather_inside import gather_inside
 from models.ops.outgoing import send
 from models.ops.per_sample import Seen
 from models.ops.precision import wide
-from models.ops.splat import gather_inside, splat_apart, splat_exp
+from models.ops.splat import splat_apart, splat_exp
 from models.ops.streaming import scattered, streamed, strip_rows
 
 EPSILON = 1e-6

@@ -30,13 +30,11 @@ from typing import Literal, NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from models.blocks.rep import SIZE, RepBlock
+from models.blocks.rep import SIZE, RepBlock, chain
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops.sharing import reconstruct
+from models.ops.ten_channels import FEATURES, depth_bounds, ten_channels
 from models.ops.tonemap import gamma
-
-FEATURES = 10
-"""Channels of the network's input: tone-mapped colour 3, albedo 3, normal 3, depth 1."""
 
 
 class Kernels(NamedTuple):
@@ -94,17 +92,8 @@ class WSKP(Denoiser):
         self.temporal = temporal
         self.halo = layers * (SIZE // 2) + max(self.kernel_sizes) // 2
         widths = [FEATURES, *[width] * (layers - 1), 2 * len(self.kernel_sizes)]
-        self.blocks = nn.ModuleList(
-            RepBlock(
-                widths[layer],
-                widths[layer + 1],
-                identity=0 < layer < layers - 1,
-                activation="none" if layer == layers - 1 else activation,
-                bias=bias,
-                batch_norm=batch_norm,
-                branches=branches,
-            )
-            for layer in range(layers)
+        self.blocks = chain(
+            widths, activation=activation, bias=bias, batch_norm=batch_norm, branches=branches
         )
 
     def forward(self, buffers: Buffers) -> Denoised:
@@ -137,19 +126,11 @@ class WSKP(Denoiser):
         return Kernels(log_importance, fusion_logits)
 
     def _features(self, buffers: Buffers) -> Tensor:
-        exposed = self.exposure(buffers) * buffers["irradiance"] * buffers["albedo"]
-        normal, depth = buffers["normal"] * 0.5 + 0.5, buffers["depth"]
-        given = buffers.get("depth_range")
-        bounds = self.measure(buffers)["depth_range"] if given is None else given.to(depth.dtype)
-        near, far = bounds[:, 0, None, None, None], bounds[:, 1, None, None, None]
-        span = far - near
-        scaled = torch.where(span > 0, (depth - near) / torch.where(span > 0, span, 1.0), 0.0)
-        return torch.cat([gamma(exposed), buffers["albedo"], normal, scaled], 1)
+        return ten_channels(buffers, self.exposure(buffers), gamma)
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of whole frames."""
-        depth = buffers["depth"].detach()
-        return {"depth_range": torch.stack([depth.amin((1, 2, 3)), depth.amax((1, 2, 3))], 1)}
+        return {"depth_range": depth_bounds(buffers["depth"])}
 
     def deploy(self) -> WSKP:
         """Return a copy with every block collapsed to one 5x5 convolution, in evaluation mode."""

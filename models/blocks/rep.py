@@ -1,7 +1,9 @@
-"""The multi-branch convolution block of WSKP (a variant of RepVGG)."""
+"""The multi-branch convolution block of WSKP and KP (a variant of RepVGG), and chains of it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal, cast
 
 import torch
@@ -63,6 +65,17 @@ class RepBlock(nn.Module):
         else:
             kernel, bias = self.collapsed()
             result = F.conv2d(image, kernel, bias, padding=SIZE // 2)
+        return self._activated(result)
+
+    def rows(self, image: Tensor) -> Tensor:
+        """Return (B, outputs, h, W) of (B, inputs, h + 4, W): rows of `forward` away from top and bottom.
+
+        Normalisation uses its running statistics.
+        """
+        kernel, bias = self.collapsed()
+        return self._activated(F.conv2d(image, kernel, bias, padding=(0, SIZE // 2)))
+
+    def _activated(self, result: Tensor) -> Tensor:
         if self.activation == "leaky_relu":
             # In place: the convolution needs its input and the activation only signs, so that one copy of
             # every feature map is kept for the backward pass instead of two.
@@ -118,3 +131,30 @@ class RepBlock(nn.Module):
         if bias is not None:
             convolution.bias = nn.Parameter(bias)
         return block.train(self.training)
+
+
+def chain(
+    widths: Sequence[int], *, activation: Activation, bias: bool, batch_norm: bool, branches: bool
+) -> nn.ModuleList:
+    """Return the blocks of WSKP's and KP's networks, one after the other.
+
+    All but the first and the last have an identity branch; the last has no activation.
+
+    Args:
+        widths: Channels of the input, between blocks, and of the output.
+        activation: Of all blocks but the last.
+        bias: As for `RepBlock`, like the other options.
+    """
+    last = len(widths) - 2
+    return nn.ModuleList(
+        RepBlock(
+            before,
+            after,
+            identity=0 < layer < last,
+            activation="none" if layer == last else activation,
+            bias=bias,
+            batch_norm=batch_norm,
+            branches=branches,
+        )
+        for layer, (before, after) in enumerate(pairwise(widths))
+    )

@@ -130,14 +130,14 @@ def scatter(kernels: Kernels, values: Tensor, beyond: bool = False) -> Tensor:
 
 
 def collect(kernels: Kernels, image: Tensor) -> Tensor:
-    """Return the sums (B, N, C, H, W) that the kernels make of images (B, N, C, H, W), zero outside."""
+    """Return the sums (B, N, C, H, W) that kernels make of images of H or H + 2 r rows; outside is 0."""
     if triton.usable(image):
         return _compiled().collect(kernels, image)
-    out = torch.empty_like(image)
-    width = image.shape[-1]
+    height, width = kernels.numbers.shape[-2:]
+    out = image.new_empty(*image.shape[:3], height, width)
     for b, n, one in kernels.images():
-        shifted = windows(_padded(image[b, n], kernels.radius, image.shape[-2]), width)
-        for rows in strips(image.shape[-2], width, kernels.size, image):
+        shifted = windows(_padded(image[b, n], kernels.radius, height), width)
+        for rows in strips(height, width, kernels.size, image):
             weights = _block(one, rows, width)
             sums = weights.new_zeros(image.shape[2], *weights.shape)
             for dy in range(kernels.size):

@@ -188,7 +188,10 @@ def _reconstruct_exported(
     ONNX Runtime transposes the image for it.
     """
     depth = log_importance.amax((-2, -1), keepdim=True) - log_importance
-    energy = torch.exp(60.0 - depth.clamp(max=EXPORTED_SPAN))
+    depth = depth.clamp(max=EXPORTED_SPAN)
+    # Whole numbers, and small where the range is: then exponents are rounded finely.
+    half = (depth.amax((-2, -1), keepdim=True) / 2).floor().clamp(max=60.0)
+    energy = torch.exp(half - depth)
     maps = [energy[:, index : index + 1] for index in range(len(kernel_sizes))]
     sums = box_sums_exported([torch.cat([irradiance * e, e], 1) for e in maps], kernel_sizes, 4)
     shares = torch.exp(fusion_logits - fusion_logits.amax(1, keepdim=True))

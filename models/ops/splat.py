@@ -25,7 +25,7 @@ from torch.autograd.function import once_differentiable
 
 from models.ops import kernel_graph as graph
 from models.ops.boxes import exporting
-from models.ops.kernel_blocks import Kernels, collect, scatter, slopes
+from models.ops.kernel_blocks import Kernels, scatter, slopes
 from models.ops.precision import wide
 
 
@@ -42,7 +42,7 @@ class Splatted(NamedTuple):
 
 
 def splat(values: Tensor, weights: Tensor, size: int, beyond: bool = False) -> Splatted:
-    """Splat values with given weights; the adjoint of `gather_weighted`.
+    """Splat values with given weights; the adjoint of `models.ops.gather_inside.gather_weighted`.
 
     Args:
         values: (B, N, C, H, W), of N samples or layers.
@@ -78,7 +78,7 @@ def splat_exp(
     if shift is not None:
         return _splatted(values, logits, _Shifts(shift), size, beyond)
     if not exporting():
-        _check(values, logits, size)
+        check_kernels(values, logits, size)
     return _splatted(values, logits, _own_shifts(logits, size), size, beyond)
 
 
@@ -100,7 +100,7 @@ def splat_apart(values: Tensor, logits: Tensor, size: int, beyond: bool = False)
         ValueError: As for `splat`.
     """
     if not exporting():
-        _check(values, logits, size)
+        check_kernels(values, logits, size)
     largest = _own_shifts(logits, size)
     assert largest.source is not None
     source = largest.source.expand(values[:, :, :1].shape)
@@ -132,65 +132,6 @@ def source_maximum(logits: Tensor) -> Tensor:
     return logits.amax((1, 2), keepdim=True)
 
 
-def gather_weighted(image: Tensor, weights: Tensor, size: int) -> Tensor:
-    """Return for every pixel the sum of its neighbours with its own weights; outside the image is nothing.
-
-    The adjoint of `splat`. `models.ops.gather` filters with softmax weights and other borders.
-
-    Args:
-        image: (B, C, H, W).
-        weights: (B, K * K, H, W); map `K * (dy + r) + dx + r` weighs the pixel dy rows below and dx columns
-            to the right.
-        size: K, odd.
-
-    Returns:
-        (B, C, H, W), not divided by the weights.
-
-    Raises:
-        ValueError: As for `splat`.
-    """
-    return _gathered(image, weights, size)
-
-
-def gather_inside(image: Tensor, logits: Tensor, size: int) -> Tensor:
-    """Filter an image with kernels of which only the part inside the image counts.
-
-    The softmax of each pixel runs over the offsets that stay in the image.
-
-    Args:
-        image: (B, C, H, W).
-        logits: (B, K * K, H, W).
-        size: K, odd.
-
-    Returns:
-        (B, C, H, W).
-
-    Raises:
-        ValueError: As for `splat`.
-    """
-    both = torch.cat([wide(image), torch.ones_like(wide(image[:, :1]))], 1)
-    if not exporting():
-        _check(both[:, None], logits[:, None], size)
-    sums = _gathered(both, logits, size, _inside_maximum(logits.detach(), size, both.dtype))
-    return sums[:, :-1] / sums[:, -1:]
-
-
-def _inside_maximum(logits: Tensor, size: int, dtype: torch.dtype) -> Tensor:
-    """Return the largest logit of every pixel over the offsets that stay in the image, (B, 1, H, W)."""
-    if exporting():
-        return graph.inside_maximum(logits, size)
-    batch, _, height, width = logits.shape
-    reach = size // 2
-    out = logits.new_full((batch, 1, height, width), -torch.inf, dtype=dtype)
-    for index in range(size * size):
-        dy, dx = divmod(index, size)
-        rows = slice(max(0, reach - dy), max(0, min(height, height + reach - dy)))
-        columns = slice(max(0, reach - dx), max(0, min(width, width + reach - dx)))
-        part = out[:, 0, rows, columns]
-        torch.maximum(part, logits[:, index, rows, columns].to(dtype), out=part)
-    return out
-
-
 class _Shifts(NamedTuple):
     """What is subtracted from logits: at the pixel that splats, with its place among the N * K * K logits
     of each batch element where it is one of them, and at the pixel that is reached."""
@@ -203,7 +144,7 @@ class _Shifts(NamedTuple):
 def _splatted(values: Tensor, numbers: Tensor, shifts: _Shifts, size: int, beyond: bool) -> Splatted:
     values = wide(values)
     if not exporting():
-        _check(values, numbers, size)
+        check_kernels(values, numbers, size)
     source, index, target = shifts
     if source is not None:
         source = source.to(values.dtype).expand(values[:, :, :1].shape)
@@ -235,22 +176,12 @@ def _own_shifts(logits: Tensor, size: int) -> _Shifts:
     return _Shifts(largest[:, None], line * size + taps.argmax(1, keepdim=True))
 
 
-def _gathered(image: Tensor, numbers: Tensor, size: int, source: Tensor | None = None) -> Tensor:
-    image = wide(image)[:, None]
-    numbers = numbers[:, None]
-    # With a shift of 0 at every pixel that is reached, offsets that leave the image have no weight at all.
-    target = None if source is None else torch.zeros_like(image[:, 0, :1])
-    source = None if source is None else source[:, None].to(image.dtype)
-    if exporting():
-        return graph.collect(image, graph.weights(numbers.to(image.dtype), size, source, target), size)[:, 0]
-    _check(image, numbers, size)
-    if torch.is_grad_enabled() and (image.requires_grad or numbers.requires_grad):
-        result: Tensor = _Gather.apply(image, numbers, source, target, size)
-        return result[:, 0]
-    return collect(Kernels(numbers, size, image.dtype, source, target), image)[:, 0]
+def check_kernels(values: Tensor, numbers: Tensor, size: int) -> None:
+    """Check values (B, N, C, H, W) and weights or logits (B, N, K * K, H, W) of K x K kernels.
 
-
-def _check(values: Tensor, numbers: Tensor, size: int) -> None:
+    Raises:
+        ValueError: K is even, or sizes differ.
+    """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"kernel size {size}; expected an odd number")
     batch, count, _, height, width = values.shape
@@ -300,28 +231,3 @@ class _Splat(torch.autograd.Function):
             change = change.to(d_numbers.dtype)
             d_numbers.view(len(change), -1, *change.shape[-2:]).scatter_add_(1, index, change)
         return d_values, d_numbers, d_source if for_source else None, None, None, None, None
-
-
-class _Gather(torch.autograd.Function):
-    """`collect` with a backward pass that computes the weights again.
-
-    dL/d(image) splats the incoming gradient g; dL/d(weight_q) = <g(p), image(p + q)>, times w_q for a logit.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, numbers: Tensor, source: Tensor | None, target: Tensor | None, size: int
-    ) -> Tensor:
-        ctx.save_for_backward(image, numbers, source, target)
-        ctx.size = size
-        return collect(Kernels(numbers, size, image.dtype, source, target), image)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        image, numbers, source, target = ctx.saved_tensors
-        kernels = Kernels(numbers, ctx.size, image.dtype, source, target)
-        for_image, for_numbers = ctx.needs_input_grad[:2]
-        d_image = scatter(kernels, gradient)[:, None, :-1] if for_image else None
-        d_numbers = slopes(kernels, gradient, image, (False, for_numbers, False)).numbers
-        return d_image, d_numbers, None, None, None

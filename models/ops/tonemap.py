@@ -41,6 +41,24 @@ def gamma(radiance: Tensor) -> Tensor:
     return torch.where(dark, bounded * (_DARKEST ** (GAMMA - 1.0)), curve)
 
 
+def filmic(radiance: Tensor) -> Tensor:
+    """Return `t (6.2 t + 0.5) / (t (6.2 t + 1.7) + 0.06)` with `t = max(x - 0.004, 0)`, in float32 or wider.
+
+    The film curve of Hejl and Burgess-Dawson, which contains the display's gamma of 2.2.
+
+    Args:
+        radiance: Exposed linear radiance of any shape; above 1e6 the curve and its gradient are flat.
+
+    Returns:
+        Values in [0, 1], 0 up to 0.004.
+
+    Source: section 5.1 of Fan et al. 2021 (doi:10.1111/cgf.14338) says only that it is filmic; the constants
+    are those of the code of NBGD's authors, on whose data it is used.
+    """
+    t = (wide(radiance) - 0.004).clamp(0.0, 1e6)
+    return t * (6.2 * t + 0.5) / (t * (6.2 * t + 1.7) + 0.06)
+
+
 def srgb_log(radiance: Tensor, darkest: float = 1e-5) -> Tensor:
     """Return sRGB(log(1 + x)) of radiance x clipped to [darkest, 65536], in float32 or wider, up to 2.7.
 

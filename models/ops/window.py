@@ -29,17 +29,20 @@ class LogMap(NamedTuple):
         values: (B, 1, H, W), finite.
         top: (B, 1, 1, 1), the maximum of each sample rounded up. Whole numbers keep `top - SPAN * band`
             free of rounding however high the map lies.
+        half: (B, 1, 1, 1), whole numbers: how far the centre of the uppermost band lies below `top`; half of
+            the range of a sample that has one band, so that exponents are small and rounded finely.
         bands: The bands that hold pixels, counted down from `top`, in ascending order.
     """
 
     values: Tensor
     top: Tensor
+    half: Tensor
     bands: list[int]
 
     def energy(self, band: int, rows: slice) -> Tensor:
         """Return exp(values) of the pixels of one band relative to its centre, 0 elsewhere."""
         values = self.values[:, :, rows]
-        shifted = values - (self.top - SPAN * (band + 0.5))
+        shifted = values - (self.top - (SPAN * band + self.half))
         if len(self.bands) == 1:
             return shifted.exp_()
         inside = ((self.top - values) / SPAN).floor_() == band
@@ -63,14 +66,15 @@ def log_maps(stack: Tensor) -> list[LogMap]:
     """Split (B, K, H, W) into K maps and find the bands of each."""
     stack = stack.detach()
     tops = stack.amax((-2, -1), keepdim=True).ceil()
-    depth = (tops - stack.amin((-2, -1), keepdim=True)).amax((0, 2, 3)).tolist()
+    depth = tops - stack.amin((-2, -1), keepdim=True)
+    half = torch.where(depth < SPAN, depth / 2, SPAN / 2).floor()
     maps = []
-    for index, deepest in enumerate(depth):
+    for index, deepest in enumerate(depth.amax((0, 2, 3)).tolist()):
         one = slice(index, index + 1)
         bands = [0]
         if deepest >= SPAN:
             bands = [int(b) for b in torch.unique(((tops - stack)[:, one] / SPAN).floor_()).tolist()]
-        maps.append(LogMap(stack[:, one], tops[:, one], bands))
+        maps.append(LogMap(stack[:, one], tops[:, one], half[:, one], bands))
     return maps
 
 

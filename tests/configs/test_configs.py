@@ -11,11 +11,12 @@ import yaml
 from trainer import configs
 
 SMOKE = "smoke.yaml"
-SAMPLES = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
-SAMPLES |= {
+OVERLAYS = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
+OVERLAYS |= {
     f"{name}_sample.yaml": f"{name}_random.yaml" for name in ("layers", "pixelgather", "samplesplat", "sbmc")
 }
-SAMPLES["layers_optimized_sample.yaml"] = "layers_optimized.yaml"
+OVERLAYS["layers_optimized_sample.yaml"] = "layers_optimized.yaml"
+OVERLAYS |= {"kp1_bmfr.yaml": "kp_bmfr.yaml", "kp2_bmfr.yaml": "kp_bmfr.yaml"}
 """Overlay → what it is laid over."""
 
 NARROW = {
@@ -51,7 +52,7 @@ print(json.dumps(codes))
 
 def arguments(name):
     """What trains a configuration for one step, an overlay with what it is laid over."""
-    files = [SAMPLES[name], name] if name in SAMPLES else [name]
+    files = [OVERLAYS[name], name] if name in OVERLAYS else [name]
     options = {
         "trainer.limit_train_batches": 1,
         "data.init_args.batch_size": 1,
@@ -61,7 +62,7 @@ def arguments(name):
         "trainer.check_val_every_n_epoch": 1,
         "trainer.logger.init_args.experiment": name.removesuffix(".yaml"),
     }
-    if name in NARROW or name in SAMPLES:  # exports of every network have tests of their own
+    if name in NARROW or name in OVERLAYS:  # exports of every network have tests of their own
         options["trainer.callbacks"] = "[{class_path: trainer.callbacks.BestCheckpoint}]"
     for part, values in NARROW.get(name, {}).items():
         options |= {f"model.init_args.{part}.{key}": value for key, value in values.items()}
@@ -86,7 +87,7 @@ def trained(tmp_path_factory):
 
 def test_defaults_and_overlays_are_there():
     assert (configs.folder() / configs.DEFAULTS).is_file()
-    assert set(configs.names()) >= {SMOKE, *SAMPLES, *SAMPLES.values()}
+    assert set(configs.names()) >= {SMOKE, *OVERLAYS, *OVERLAYS.values()}
 
 
 @pytest.mark.parametrize("name", configs.names())
@@ -105,11 +106,11 @@ def test_configuration_trains_for_one_step(name, trained):
     assert list(run.glob("*/checkpoints/best.ckpt"))
 
 
-@pytest.mark.parametrize(("overlay", "base"), SAMPLES.items())
+@pytest.mark.parametrize(("overlay", "base"), OVERLAYS.items())
 def test_an_overlay_keeps_method_and_data_of_what_it_is_laid_over(overlay, base):
     over, under = (yaml.safe_load((configs.folder() / name).read_text()) for name in (overlay, base))
     assert over["model"]["class_path"] == under["model"]["class_path"]
     networks = [file["model"]["init_args"]["net"]["class_path"] for file in (over, under)]
     assert networks[0] == networks[1]
-    assert under["data"]["init_args"]["root"] in ("sample:stills", "sample:layers")
-    assert "root" not in over["data"]["init_args"]
+    assert under["data"]["init_args"]["root"] in ("sample:bmfr", "sample:stills", "sample:layers")
+    assert "root" not in over.get("data", {}).get("init_args", {})

@@ -23,6 +23,27 @@ def random_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[s
     }
 
 
+def noisy_edges(batch: int, height: int, width: int, seed: int = 0) -> tuple[dict[str, Tensor], Tensor]:
+    """Return buffers of dark and bright blocks of 8 pixels with noisy light, and the reference.
+
+    Normals tell the blocks apart, so that a network can learn not to blur across their edges.
+    """
+    buffers = random_buffers(batch, height, width, seed)
+    rows, columns = torch.arange(height) // 8, torch.arange(width) // 8
+    bright = ((rows[:, None] + columns) % 2).float()
+    light = 0.1 + 0.9 * bright.expand(batch, 3, -1, -1)
+    normal = torch.zeros_like(buffers["normal"])
+    normal[:, 0], normal[:, 2] = bright, 1 - bright
+    noise = buffers["irradiance"] / 2  # of mean 1
+    noisy = {
+        **buffers,
+        "normal": normal,
+        "irradiance": light * noise,
+        "depth": torch.ones(batch, 1, height, width),
+    }
+    return noisy, light * buffers["albedo"]
+
+
 def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
     """Return those and color, its diffuse and specular parts, references, halves and variances."""
     buffers = lit(random_buffers(batch, height, width, seed))

@@ -18,7 +18,7 @@ from models import WSKP
 from models.denoiser import Buffers, Denoised, Denoiser
 from tests.conformance.test_denoisers import make
 from trainer.commands import export as command
-from trainer.export import SUFFIXES, Source, export, load_artifact
+from trainer.export import SUFFIXES, Source, export, load_artifact, parity
 from trainer.export.artifact import _OnnxRuntime
 from trainer.export.description import KEY, Description
 from trainer.export.entry import Sampled, example
@@ -331,3 +331,17 @@ def test_a_failure_of_onnx_runtime_is_told_in_one_line():
     runtime = _OnnxRuntime(model.SerializeToString(), "cpu")
     with pytest.raises(OSError, match=r"ONNX Runtime cannot run the model .*Reshape"):
         runtime({"color": torch.zeros(1, 3, 4, 4)})
+
+
+def test_rounding_excuses_an_artifact_only_around_the_pixels_where_eager_rounds() -> None:
+    exact = torch.ones(1, 3, 20, 20, dtype=torch.float64)
+    exact[..., 5, 5] = 1000.0
+    eager = exact.clone()
+    eager[..., 5, 5] += 5e-4  # 5e-7 of the pixel, 5e-4 of those around
+    near, far, bad = exact.clone(), exact.clone(), exact.clone()
+    near[:, 0, 6, 8] += 8e-4
+    far[:, 0, 15, 15] += 8e-4
+    bad[:, 0, 6, 8] += 1.2e-3
+    assert parity._as_exact(near, eager, exact) == pytest.approx(5e-7, rel=1e-2)
+    assert parity._as_exact(far, eager, exact) is None
+    assert parity._as_exact(bad, eager, exact) is None

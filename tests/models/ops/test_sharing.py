@@ -204,3 +204,14 @@ def test_an_even_kernel_is_refused() -> None:
     maps = random_maps(16, 16)
     with pytest.raises(ValueError, match="odd and positive"):
         reconstruct(*maps, (3, 5, 7, 9, 11, 12))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_maps_of_a_small_range_are_summed_to_a_few_roundings(
+    recorded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = [t[:, :2] if i else t for i, t in enumerate(t.float() for t in random_maps(40, 50))]
+    monkeypatch.setattr(sharing, "exporting", lambda: recorded)
+    expected = reconstruct_by_softmax(*(t.double() for t in maps), (3, 5))
+    error = (reconstruct(*maps, (3, 5)).double() - expected).abs() / expected
+    assert error.max() < 6e-7

@@ -8,10 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from models.ops import kernel_blocks
+from models.ops.gather_inside import gather_inside, gather_weighted
 from models.ops.splat import (
     Splatted,
-    gather_inside,
-    gather_weighted,
     splat,
     splat_apart,
     splat_exp,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.ops.tonemap import LARGEST, exposed, gamma, radiance_of
+from models.ops.tonemap import LARGEST, exposed, filmic, gamma, radiance_of
 
 
 def test_gamma_is_the_clamped_power_of_the_authors() -> None:
@@ -56,3 +56,23 @@ def test_radiance_of_a_logarithm_is_its_inverse_also_in_recorded_graphs(
     assert logs.grad is not None
     torch.testing.assert_close(logs.grad[1:9], LOGS[1:9].exp(), rtol=2e-6, atol=0)
     assert logs.grad[0] == logs.grad[-1] == 0
+
+
+def test_filmic_is_the_curve_as_printed_and_0_up_to_its_toe() -> None:
+    radiance = torch.tensor([-3.0, 0.0, 0.004, 0.01, 0.18, 1.0, 20.0, 65504.0, 1e9])
+    t = (radiance.double() - 0.004).clamp_min(0)
+    expected = (t * (6.2 * t + 0.5) / (t * (6.2 * t + 1.7) + 0.06)).float()
+    torch.testing.assert_close(filmic(radiance), expected)
+    assert (filmic(radiance[:3]) == 0).all()
+    assert filmic(torch.tensor(1.004)).item() == pytest.approx(6.7 / 7.96)
+    assert filmic(torch.tensor([0.2], dtype=torch.bfloat16)).dtype == torch.float32
+
+
+def test_filmic_stays_within_1_with_finite_gradients() -> None:
+    radiance = torch.tensor([-1.0, 0.0, 0.004, 0.5, 65504.0, 1e12, 1e30, torch.inf], requires_grad=True)
+    found = filmic(radiance)
+    assert ((found >= 0) & (found <= 1)).all()
+    found.sum().backward()
+    assert radiance.grad is not None
+    assert radiance.grad.isfinite().all()
+    assert radiance.grad[3] > 0
