@@ -15,6 +15,7 @@ from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
+from models.nbgd import NBGD
 from models.sbmc import SBMC
 from models.wskp import WSKP
 
@@ -22,6 +23,7 @@ __all__ = [
     "ACFM",
     "AFGSA",
     "KPCN",
+    "NBGD",
     "NFOR",
     "NLM",
     "SBMC",

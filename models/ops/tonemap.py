@@ -41,6 +41,24 @@ def gamma(radiance: Tensor) -> Tensor:
     return torch.where(dark, bounded * (_DARKEST ** (GAMMA - 1.0)), curve)
 
 
+def filmic(radiance: Tensor) -> Tensor:
+    """Return t (6.2 t + 0.5) / (t (6.2 t + 1.7) + 0.06), t = max(0, x - 0.004), in float32 or wider.
+
+    A film's curve that includes the display's gamma of about 2.2.
+
+    Args:
+        radiance: Exposed linear radiance of any shape, up to `LARGEST`.
+
+    Returns:
+        Values in [0, 1).
+
+    Source: J. Hable, after J. Hejl and R. Burgess-Dawson; as in the code of Meng et al. 2020
+    (doi:10.2312/sr.20201133) for 64 samples per pixel.
+    """
+    value = (wide(radiance) - 0.004).clamp_min(0.0)
+    return value * (6.2 * value + 0.5) / (value * (6.2 * value + 1.7) + 0.06)
+
+
 def srgb_log(radiance: Tensor, darkest: float = 1e-5) -> Tensor:
     """Return sRGB(log(1 + x)) of radiance x clipped to [darkest, 65536], in float32 or wider, up to 2.7.
 

@@ -21,10 +21,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
-KERNEL_METHODS = {"KPCN", "WSKP", "JointBilateral", "SBMC", *LAYERS}
+KERNEL_METHODS = {"KPCN", "NBGD", "WSKP", "JointBilateral", "SBMC", *LAYERS}
 """Outputs are convex combinations of input pixels: a constant image stays constant."""
 
-CLEANING = {"ACFM", "AFGSA", "KPCN", "SBMC", *LAYERS}
+CLEANING = {"ACFM", "AFGSA", "KPCN", "NBGD", "SBMC", *LAYERS}
 """Methods that take radiance which is negative, infinite or not a number; the data module repairs it for the
 others."""
 

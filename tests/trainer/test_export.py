@@ -207,7 +207,7 @@ def test_every_network_is_exported_and_takes_any_size(tmp_path: Path, name: str,
         buffers = buffers_of(net, *size)
         with torch.inference_mode():
             expected = net(buffers).color
-        assert relative_error(artifact(buffers).color, expected) < LIMIT
+        assert relative_error(artifact(buffers).color, expected, net.rounding_reach) < LIMIT
 
 
 def test_export_leaves_the_denoiser_as_it_was(tmp_path: Path) -> None:
@@ -291,6 +291,17 @@ def test_relative_error_sees_a_single_wrong_pixel_and_nan() -> None:
     assert relative_error(wrong, expected) == pytest.approx(0.01 / 1.01, rel=1e-3)
     wrong[0, 0, 0, 0] = np.nan
     assert relative_error(wrong, expected) == float("inf")
+
+
+def test_relative_error_is_relative_to_the_brightest_pixel_of_a_channel_within_reach() -> None:
+    expected = torch.ones(1, 3, 8, 8)
+    expected[0, 1, 2, 5] = 999.0
+    wrong = expected.clone()
+    wrong[0, 1, 4, 4] += 0.5
+    assert relative_error(wrong, expected, 2) == pytest.approx(0.5 / 999.01)
+    assert relative_error(wrong, expected, 1) == pytest.approx(0.5 / 1.01)
+    wrong[0, 1, 4, 4], wrong[0, 2, 4, 4] = 1.0, 1.5
+    assert relative_error(wrong, expected, 2) == pytest.approx(0.5 / 1.01)
 
 
 def test_outputs_get_the_models_name_in_a_folder_and_the_suffix_must_fit(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Does an artifact compute what the module it was made from computes?
 
 The error of an image is the largest `|artifact - eager| / (|eager| + 0.01 m)`, m being the image's median
-`|eager|`, which keeps black pixels next to bright ones from dividing by nothing.
+`|eager|`, which keeps black pixels next to bright ones from dividing by nothing. Where a method's weights are
+rounded as shares of 1 (`models.denoiser.Denoiser.rounding_reach`), the divisor has the channel's largest
+`|eager|` within that reach in place of the pixel's own.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import copy
 from collections.abc import Mapping
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from models.denoiser import Denoiser
@@ -28,13 +31,21 @@ COUNTS = (3, 8, 1, 2, 5)
 """Samples per pixel at each of these sizes."""
 
 
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Return the largest relative difference of two images (B, C, H, W); infinite where one is not finite."""
+def relative_error(found: Tensor, expected: Tensor, reach: int = 0) -> float:
+    """Return the largest relative difference of two images (B, C, H, W); infinite where one is not finite.
+
+    Args:
+        found: What is judged.
+        expected: What it should be.
+        reach: Differences are relative to the largest expected value within so many pixels.
+    """
     if found.shape != expected.shape:
         raise ValueError(f"shape {tuple(found.shape)}, expected {tuple(expected.shape)}")
-    size = expected.abs().flatten(1)
-    floor = 0.01 * size.median(dim=1, keepdim=True).values + 1e-8
-    error = (found - expected).abs().flatten(1) / (size + floor)
+    size = expected.abs()
+    floor = 0.01 * size.flatten(1).median(dim=1, keepdim=True).values + 1e-8
+    if reach:
+        size = F.max_pool2d(size, 2 * reach + 1, 1, reach)
+    error = (found - expected).abs().flatten(1) / (size.flatten(1) + floor)
     return float(error.amax()) if bool(torch.isfinite(error).all()) else float("inf")
 
 
@@ -60,11 +71,12 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
             expected = denoiser(buffers).color
             try:
                 found = artifact(buffers).color
-                error = relative_error(found, expected)
+                error = relative_error(found, expected, denoiser.rounding_reach)
             except Exception as failure:
                 raise ValueError(f"the exported file does not run at {place}: {failure}") from failure
             if not error <= limit:
-                own = _as_exact(found, expected, _in_double(denoiser, buffers))
+                exact = _in_double(denoiser, buffers)
+                own = _as_exact(found, expected, exact, denoiser.rounding_reach)
                 if own is None:
                     raise ValueError(
                         f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}"
@@ -80,10 +92,10 @@ def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
     return copy.deepcopy(denoiser).double()(wide).color
 
 
-def _as_exact(found: Tensor, eager: Tensor, exact: Tensor) -> float | None:
+def _as_exact(found: Tensor, eager: Tensor, exact: Tensor, reach: int) -> float | None:
     """Return eager's error against float64 where the artifact's is not much larger, otherwise None."""
-    own = relative_error(eager.double(), exact)
-    return own if relative_error(found.double(), exact) <= ROUNDING * own < UNUSABLE else None
+    own = relative_error(eager.double(), exact, reach)
+    return own if relative_error(found.double(), exact, reach) <= ROUNDING * own < UNUSABLE else None
 
 
 def _compare_measured(artifact: Artifact, denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> None:

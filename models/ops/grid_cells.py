@@ -1,0 +1,168 @@
+"""Cells of a bilateral grid: which lie around a pixel, and what they weigh.
+
+A grid has a cell for every s x s pixels and every r levels of a guide that runs from 0 to 255; the middle of
+cell (u, v, d) lies at (u + 0.5, v + 0.5, d + 0.5). With the tent t(x) = max(0, 1 - sqrt(x^2 + 1e-8)), pixel
+(x, y) of guide g and cell (u, v, d) have the weight
+
+    w = t((x + 0.5) / s - u - 0.5)  t((y + 0.5) / s - v - 0.5)  t((g + 0.5) / r - d - 0.5)
+
+which is above 0 for eight cells at most. `models.ops.bilateral_grid` says what they are for.
+
+Source: Meng et al. 2020 (doi:10.2312/sr.20201133), formulas as in the authors' code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LEVELS = 256
+"""Levels of the guide that cells share out."""
+
+_ROUNDED = 1e-8
+"""Rounds the tip of the tent, so that its slope has no jump there."""
+
+_CHUNK = 1 << 14
+"""Pixels processed at once on a CPU: what is made of them for one cell after the other takes 1 MB."""
+
+_CHUNK_DEVICE = 1 << 20
+"""The same on other devices, where calls cost more and memory less."""
+
+
+class Cells(NamedTuple):
+    """The size of the cells of a grid.
+
+    Attributes:
+        space: Pixels along each side of a cell.
+        depth: Levels of the guide in a cell, a divisor of 256 and at most half of it.
+    """
+
+    space: int
+    depth: int
+
+    @property
+    def reach(self) -> int:
+        """Pixels beyond a core, cut where cells begin, that what is read there depends on: half a cell beyond
+        the core lies the middle of the next one, which sees pixels less than a whole cell away."""
+        return self.space // 2 + self.space
+
+    def counts(self, guide: Tensor) -> tuple[int, int, int]:
+        """Return the number of cells down, across and deep for a guide (..., H, W)."""
+        height, width = guide.shape[-2:]
+        return height // self.space, width // self.space, LEVELS // self.depth
+
+    def check(self, guide: Tensor, image: tuple[int, ...]) -> None:
+        """Refuse impossible cells, and a guide or an image (B, C, H, W) that does not fit.
+
+        Raises:
+            ValueError: Says what was expected and what came.
+        """
+        space, depth = self
+        if space < 1 or depth < 1 or LEVELS % depth or depth > LEVELS // 2:
+            raise ValueError(
+                f"cells of {space} pixels and {depth} levels; expected at least one of each, and levels that "
+                f"divide {LEVELS} into two cells or more"
+            )
+        batch, _, height, width = image
+        if tuple(guide.shape) != (batch, 1, height, width):
+            raise ValueError(
+                f"the guide has shape {tuple(guide.shape)}, expected {(batch, 1, height, width)} for an "
+                f"image of shape {tuple(image)}"
+            )
+        if height % space or width % space:
+            raise ValueError(f"an image of {width}x{height}; expected sides that are multiples of {space}")
+
+
+class _Side(NamedTuple):
+    """The two cells around the pixels along a side.
+
+    Attributes:
+        cell: (2, N).
+        weight: (2, N), 0 where there is no cell beyond the image.
+    """
+
+    cell: Tensor
+    weight: Tensor
+
+
+def pieces(guide: Tensor) -> Iterator[tuple[int, slice]]:
+    """Return the groups of rows of a guide (B, 1, H, W) that are processed at once, image by image."""
+    batch, _, height, width = guide.shape
+    limit = _CHUNK if guide.device.type == "cpu" else _CHUNK_DEVICE
+    step = max(1, limit // width)
+    return ((b, slice(row, min(height, row + step))) for b in range(batch) for row in range(0, height, step))
+
+
+def around(
+    guide: Tensor, cells: Cells, image: int, rows: slice, slopes: bool = False
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return the eight cells around the pixels of some rows, one after the other.
+
+    Args:
+        guide: (B, 1, H, W).
+        cells: Size of the cells.
+        image: Which of the batch.
+        rows: Which of its rows, h in all.
+        slopes: Return slopes of the weights in the guide instead.
+
+    Returns:
+        Index (h * W,) into the flattened cells of one image, and weight (h, W).
+    """
+    down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
+    some = _Side(down.cell[:, rows], down.weight[:, rows])
+    for index, weight in _eight(guide[image, 0, rows], some, across, cells.counts(guide), slopes):
+        yield index.flatten(), weight
+
+
+def around_all(guide: Tensor, cells: Cells) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return the eight cells around all pixels, in a form that a recorded graph can hold for every size.
+
+    Args:
+        guide: (B, 1, H, W).
+        cells: Size of the cells.
+
+    Returns:
+        Index (B * H * W,) into the flattened cells of the whole batch, and weight (B * H * W, 1).
+    """
+    down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
+    counts = cells.counts(guide)
+    images = torch.arange(guide.shape[0], device=guide.device)[:, None, None]
+    before = images * (counts[0] * counts[1] * counts[2])
+    for index, weight in _eight(guide[:, 0], down, across, counts):
+        yield (index + before).reshape(-1), weight.reshape(-1, 1)
+
+
+def _side(count: int, space: int, like: Tensor) -> _Side:
+    place = (torch.arange(count, device=like.device).to(like.dtype) + 0.5) / space - 0.5
+    cell = torch.floor(place).long() + torch.arange(2, device=like.device)[:, None]
+    inside = (cell >= 0) & (cell < count // space)
+    return _Side(torch.where(inside, cell, 0), _tent(place - cell)[0] * inside)
+
+
+def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the tent at a distance, and its slope."""
+    rounded = (distance.square() + _ROUNDED).sqrt()
+    tent = (1.0 - rounded).clamp_min(0.0)
+    return tent, -distance / rounded * (tent > 0)
+
+
+def _eight(
+    guide: Tensor, down: _Side, across: _Side, counts: tuple[int, int, int], slopes: bool = False
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return index and weight, or its slope, of each of eight cells, for guides (..., rows, columns)."""
+    _, columns, deep = counts
+    place = (guide + 0.5) * (deep / LEVELS) - 0.5
+    # At the ends of the guide there is one cell only; the tent is 0 at the other of these two.
+    low = torch.nan_to_num(torch.floor(place).clamp(0.0, deep - 2.0), 0.0)
+    tents = [_tent(place - low), _tent(place - low - 1.0)]
+    depth = [slope * (deep / LEVELS) if slopes else tent for tent, slope in tents]
+    low = low.long()
+    for v in range(2):
+        for u in range(2):
+            index = low + (down.cell[v, :, None] * columns + across.cell[u]) * deep
+            area = down.weight[v, :, None] * across.weight[u]
+            yield index, area * depth[0]
+            yield index + 1, area * depth[1]
