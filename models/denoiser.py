@@ -72,7 +72,7 @@ class Denoiser(nn.Module):
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         exported_bytes_per_pixel: `bytes_per_pixel` of exported files, where it is more than half as much
             again; 0: it is not.
-        rounding_reach: Pixels around a pixel whose largest value its rounding is relative to; 0: its own value.
+        rounding_reach: Pixels around a pixel whose largest value its rounding is relative to; 0: its own.
             For methods that make weights by subtraction: 1e-5 more or less of a firefly reaches dark pixels
             near it, little beside the firefly and much beside them. Exported files are judged on that scale.
         no_export: Why the method is not exported as ONNX or TorchScript; empty where it is.
