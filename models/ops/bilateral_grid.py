@@ -75,8 +75,8 @@ def slice_grid(grid: Tensor, guide: Tensor, cells: Cells, limit: float | None = 
     guide = guide.to(grid.dtype)
     if exporting():
         return _slice_exported(grid, guide, cells)
-    cells.check(guide, (guide.shape[0], grid.shape[1], *guide.shape[2:]))
-    expected = (*grid.shape[:2], *cells.counts(guide))
+    cells.check(guide, tuple(guide.shape))
+    expected = (guide.shape[0], grid.shape[1], *cells.counts(guide))
     if tuple(grid.shape) != expected:
         raise ValueError(f"a grid has shape {tuple(grid.shape)}, expected {expected}")
     if torch.is_grad_enabled() and (grid.requires_grad or guide.requires_grad):

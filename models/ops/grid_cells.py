@@ -80,8 +80,8 @@ class _Side(NamedTuple):
     """The two cells around the pixels along a side.
 
     Attributes:
-        cell: (2, N).
-        weight: (2, N), 0 where there is no cell beyond the image.
+        cell: (2, N); the nearest where there is none beyond the image.
+        weight: (2, N), 0 there.
     """
 
     cell: Tensor
@@ -138,8 +138,9 @@ def around_all(guide: Tensor, cells: Cells) -> Iterator[tuple[Tensor, Tensor]]:
 def _side(count: int, space: int, like: Tensor) -> _Side:
     place = (torch.arange(count, device=like.device).to(like.dtype) + 0.5) / space - 0.5
     cell = torch.floor(place).long() + torch.arange(2, device=like.device)[:, None]
-    inside = (cell >= 0) & (cell < count // space)
-    return _Side(torch.where(inside, cell, 0), _tent(place - cell)[0] * inside)
+    below = cell < count // space
+    weight = _tent(place - cell)[0] * (below & (cell >= 0))
+    return _Side(torch.where(below, cell, cell - 1).clamp_min(0), weight)
 
 
 def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
