@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from models.ops.boxes import exporting
-from models.ops.grid_cells import Cells, around, around_all, pieces
+from models.ops.grid_cells import Cells, around, around_all
 from models.ops.precision import wide
 
 
@@ -175,9 +175,9 @@ def _scatter(values: Tensor, guide: Tensor, cells: Cells) -> Tensor:
     """Return sum_pixels w values, (B, C, v, u, d), of values (B, C, H, W)."""
     counts = cells.counts(guide)
     sums = values.new_zeros(*values.shape[:2], counts[0] * counts[1] * counts[2])
-    for image, rows in pieces(guide):
+    for image, rows, taps in around(guide, cells):
         some = values[image, :, rows]
-        for index, weight in around(guide, cells, image, rows):
+        for index, weight in taps:
             sums[image].index_add_(1, index, (some * weight).flatten(1))
     return sums.unflatten(2, counts)
 
@@ -195,14 +195,14 @@ def _gather(grid: Tensor, guide: Tensor, cells: Cells, slopes: bool = False, cou
     """
     flat, channels = grid.flatten(2), grid.shape[1] * (1 + counted)
     made = grid.new_zeros(grid.shape[0], channels, *guide.shape[2:])
-    for image, rows in pieces(guide):
+    for image, rows, taps in around(guide, cells, slopes):
         some = made[image, :, rows]
-        for index, weight in around(guide, cells, image, rows, slopes):
-            values = flat[image].index_select(1, index)
+        total, counts = some[: grid.shape[1]], some[grid.shape[1] :]
+        for index, weight in taps:
+            values = flat[image].index_select(1, index).view_as(total)
             if counted:
-                values = values.clamp_min_(0.0)
-                values = torch.cat([values, values.sign()])
-            some.addcmul_(values.view_as(some), weight)
+                counts.addcmul_(values.clamp_min_(0.0).sign(), weight)
+            total.addcmul_(values, weight)
     return made
 
 

@@ -25,8 +25,8 @@ LEVELS = 256
 _ROUNDED = 1e-8
 """Rounds the tip of the tent, so that its slope has no jump there."""
 
-_CHUNK = 1 << 14
-"""Pixels processed at once on a CPU: what is made of them for one cell after the other takes 1 MB."""
+_CHUNK = 1 << 15
+"""Pixels processed at once on a CPU: what is made of them for one cell after the other takes 2 MB."""
 
 _CHUNK_DEVICE = 1 << 20
 """The same on other devices, where calls cost more and memory less."""
@@ -88,50 +88,49 @@ class _Side(NamedTuple):
     weight: Tensor
 
 
-def pieces(guide: Tensor) -> Iterator[tuple[int, slice]]:
-    """Return the groups of rows of a guide (B, 1, H, W) that are processed at once, image by image."""
-    batch, _, height, width = guide.shape
-    limit = _CHUNK if guide.device.type == "cpu" else _CHUNK_DEVICE
-    step = max(1, limit // width)
-    return ((b, slice(row, min(height, row + step))) for b in range(batch) for row in range(0, height, step))
+Taps = Iterator[tuple[Tensor, Tensor]]
+"""Index into flattened cells and weight, of each of the eight cells around pixels."""
 
 
-def around(
-    guide: Tensor, cells: Cells, image: int, rows: slice, slopes: bool = False
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return the eight cells around the pixels of some rows, one after the other.
+def around(guide: Tensor, cells: Cells, slopes: bool = False) -> Iterator[tuple[int, slice, Taps]]:
+    """Return the cells around all pixels, piece by piece.
 
     Args:
         guide: (B, 1, H, W).
         cells: Size of the cells.
-        image: Which of the batch.
-        rows: Which of its rows, h in all.
         slopes: Return slopes of the weights in the guide instead.
 
     Returns:
-        Index (h * W,) into the flattened cells of one image, and weight (h, W).
+        Which of the batch, which of its rows, h in all, and for each of the eight cells the index (h * W,)
+        into those of one image and the weight (h, W).
     """
-    down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
-    some = _Side(down.cell[:, rows], down.weight[:, rows])
-    for index, weight in _eight(guide[image, 0, rows], some, across, cells.counts(guide), slopes):
-        yield index.flatten(), weight
+    batch, _, height, width = guide.shape
+    down, across = _side(height, cells.space, guide), _side(width, cells.space, guide)
+    _, columns, deep = cells.counts(guide)
+    limit = _CHUNK if guide.device.type == "cpu" else _CHUNK_DEVICE
+    step = max(1, limit // width)
+    for first in range(0, height, step):
+        rows = slice(first, min(height, first + step))
+        planes = list(_planes(_Side(down.cell[:, rows], down.weight[:, rows]), across, columns, deep))
+        for image in range(batch):
+            taps = _eight(guide[image, 0, rows], planes, deep, slopes)
+            yield image, rows, ((index.flatten(), weight) for index, weight in taps)
 
 
-def around_all(guide: Tensor, cells: Cells) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return the eight cells around all pixels, in a form that a recorded graph can hold for every size.
+def around_all(guide: Tensor, cells: Cells) -> Taps:
+    """Return the cells around all pixels at once, in a form that a recorded graph can hold for every size.
 
     Args:
         guide: (B, 1, H, W).
         cells: Size of the cells.
 
     Returns:
-        Index (B * H * W,) into the flattened cells of the whole batch, and weight (B * H * W, 1).
+        Index (B * H * W,) into the cells of the whole batch, and weight (B * H * W, 1).
     """
     down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
-    counts = cells.counts(guide)
-    images = torch.arange(guide.shape[0], device=guide.device)[:, None, None]
-    before = images * (counts[0] * counts[1] * counts[2])
-    for index, weight in _eight(guide[:, 0], down, across, counts):
+    rows, columns, deep = cells.counts(guide)
+    before = torch.arange(guide.shape[0], device=guide.device)[:, None, None] * (rows * columns * deep)
+    for index, weight in _eight(guide[:, 0], list(_planes(down, across, columns, deep)), deep, False):
         yield (index + before).reshape(-1), weight.reshape(-1, 1)
 
 
@@ -143,27 +142,32 @@ def _side(count: int, space: int, like: Tensor) -> _Side:
     return _Side(torch.where(below, cell, cell - 1).clamp_min(0), weight)
 
 
-def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the tent at a distance, and its slope."""
-    rounded = (distance.square() + _ROUNDED).sqrt()
-    tent = (1.0 - rounded).clamp_min(0.0)
-    return tent, -distance / rounded * (tent > 0)
-
-
-def _eight(
-    guide: Tensor, down: _Side, across: _Side, counts: tuple[int, int, int], slopes: bool = False
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Return index and weight, or its slope, of each of eight cells, for guides (..., rows, columns)."""
-    _, columns, deep = counts
-    place = (guide + 0.5) * (deep / LEVELS) - 0.5
-    # At the ends of the guide there is one cell only; the tent is 0 at the other of these two.
-    low = torch.nan_to_num(torch.floor(place).clamp(0.0, deep - 2.0), 0.0)
-    tents = [_tent(place - low), _tent(place - low - 1.0)]
-    depth = [slope * (deep / LEVELS) if slopes else tent for tent, slope in tents]
-    low = low.long()
+def _planes(down: _Side, across: _Side, columns: int, deep: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return, of four stacks of cells, index of the first and weight of all, (rows, columns)."""
     for v in range(2):
         for u in range(2):
-            index = low + (down.cell[v, :, None] * columns + across.cell[u]) * deep
-            area = down.weight[v, :, None] * across.weight[u]
-            yield index, area * depth[0]
-            yield index + 1, area * depth[1]
+            index = (down.cell[v, :, None] * columns + across.cell[u]) * deep
+            yield index, down.weight[v, :, None] * across.weight[u]
+
+
+def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the tent at a distance, and the rounded distance."""
+    rounded = (distance.square() + _ROUNDED).sqrt()
+    return (1.0 - rounded).clamp_min(0.0), rounded
+
+
+def _eight(guide: Tensor, planes: list[tuple[Tensor, Tensor]], deep: int, slopes: bool) -> Taps:
+    """Return index and weight, or its slope, (..., rows, columns), for guides of that shape."""
+    place = guide * (deep / LEVELS) + (0.5 * deep / LEVELS - 0.5)
+    # At the ends of the guide there is one cell only; the tent is 0 at the other of these two.
+    low = torch.nan_to_num(torch.floor(place).clamp(0.0, deep - 2.0), 0.0)
+    near = place - low
+    near = torch.stack([near, near - 1.0])
+    depth, rounded = _tent(near)
+    if slopes:
+        depth = near / rounded * (depth > 0) * (-deep / LEVELS)
+    low = low.long()
+    for first, area in planes:
+        index = low + first
+        yield index, area * depth[0]
+        yield index + 1, area * depth[1]
