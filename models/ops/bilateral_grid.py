@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from models.ops.boxes import exporting
-from models.ops.grid_cells import Cells, around, around_all
+from models.ops.grid_cells import SLOPE, WEIGHT, Cells, around_all, pieces
 from models.ops.precision import wide
 
 
@@ -100,11 +100,18 @@ def _means(sums: Tensor) -> tuple[Tensor, Tensor]:
     return sums[:, :-1] / divisor, divisor
 
 
-def _read(grid: Tensor, guide: Tensor, cells: Cells) -> tuple[Tensor, Tensor]:
-    """Return pixels and what they were divided by, (B, C, H, W) each."""
-    total, weight = _gather(grid, guide, cells, counted=True).chunk(2, 1)
+def _read(
+    grid: Tensor, guide: Tensor, cells: Cells, slopes: bool = False
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return pixels, what they were divided by, and their slopes in the guide, (B, C, H, W) each."""
+    parts = _gather(grid, guide, cells, WEIGHT + SLOPE if slopes else WEIGHT, counted=True)
+    total, weight = parts[0].chunk(2, 1)
     divisor = _divisor(weight)
-    return total / divisor, divisor
+    made = total / divisor
+    if not slopes:
+        return made, divisor, None
+    steep, counts = parts[1].chunk(2, 1)
+    return made, divisor, (steep - made * counts) / divisor
 
 
 def _limited(gradient: Tensor, limit: float | None) -> Tensor:
@@ -133,10 +140,12 @@ class _Create(torch.autograd.Function):
         for_image, for_guide = ctx.needs_input_grad[:2]
         share, d_image, d_guide = gradient / divisor, None, None
         if for_image:
-            d_image = _limited(_gather(share, guide, ctx.cells), ctx.limit)
+            d_image = _limited(_gather(share, guide, ctx.cells)[0], ctx.limit)
         if for_guide:
-            both = torch.cat([share, (share * grid).sum(1, keepdim=True)], 1)
-            steep = _gather(both, guide, ctx.cells, slopes=True)
+            both = torch.cat([share, share[:, :1] * grid[:, :1]], 1)
+            for channel in range(1, grid.shape[1]):
+                both[:, -1].addcmul_(share[:, channel], grid[:, channel])
+            steep = _gather(both, guide, ctx.cells, SLOPE)[0]
             d_guide = (steep[:, :-1] * image).sum(1, keepdim=True).sub_(steep[:, -1:])
             d_guide = _limited(d_guide, ctx.limit)
         return d_image, d_guide, None, None
@@ -148,62 +157,72 @@ class _Slice(torch.autograd.Function):
     With pixels p, sums of weights W, incoming gradients g and h = g / W, over cells c that count:
 
         dL/d(cell) = sum_pixels w h,      dL/d(guide) = sum_cells dw <h, c - p>
+
+    What g is multiplied with in the second is formed with p, for which cells are looked up anyhow.
     """
 
     @staticmethod
     def forward(ctx: Any, grid: Tensor, guide: Tensor, cells: Cells, limit: float | None) -> Tensor:
-        made, divisor = _read(grid, guide, cells)
-        ctx.save_for_backward(grid, guide, made, divisor)
+        made, divisor, steep = _read(grid, guide, cells, ctx.needs_input_grad[1])
+        for_grid = ctx.needs_input_grad[0]
+        ctx.save_for_backward(guide, *((grid, divisor) if for_grid else (None, None)), steep)
         ctx.cells, ctx.limit = cells, limit
         return made
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        grid, guide, made, divisor = ctx.saved_tensors
-        for_grid, for_guide = ctx.needs_input_grad[:2]
-        share, d_grid, d_guide = gradient / divisor, None, None
-        if for_grid:
-            d_grid = _limited(_scatter(share, guide, ctx.cells).mul_(grid > 0), ctx.limit)
-        if for_guide:
-            steep, counts = _gather(grid, guide, ctx.cells, slopes=True, counted=True).chunk(2, 1)
-            d_guide = _limited((share * (steep - made * counts)).sum(1, keepdim=True), ctx.limit)
+        guide, grid, divisor, steep = ctx.saved_tensors
+        d_grid = d_guide = None
+        if grid is not None:
+            d_grid = _scatter(gradient / divisor, guide, ctx.cells).mul_(grid > 0)
+            d_grid = _limited(d_grid, ctx.limit)
+        if steep is not None:
+            d_guide = _limited((gradient * steep).sum(1, keepdim=True), ctx.limit)
         return d_grid, d_guide, None, None
 
 
 def _scatter(values: Tensor, guide: Tensor, cells: Cells) -> Tensor:
-    """Return sum_pixels w values, (B, C, v, u, d), of values (B, C, H, W)."""
+    """Return sum_pixels w values, (B, C, v, u, d), of values (B, C, H, W); channels outermost in memory."""
+    batch, channels = values.shape[:2]
     counts = cells.counts(guide)
-    sums = values.new_zeros(*values.shape[:2], counts[0] * counts[1] * counts[2])
-    for image, rows, taps in around(guide, cells):
-        some = values[image, :, rows]
-        for index, weight in taps:
-            sums[image].index_add_(1, index, (some * weight).flatten(1))
-    return sums.unflatten(2, counts)
+    sums = values.new_zeros(channels, batch * counts[0] * counts[1] * counts[2])
+    for piece in pieces(guide, cells):
+        some = values[piece.images, :, piece.rows].transpose(0, 1)
+        parts = [some * depth for depth in piece.depths[0]]
+        for index, area, upper in piece.taps:
+            sums.index_add_(1, index, (parts[upper] * area).flatten(1))
+    return sums.unflatten(1, (batch, *counts)).transpose(0, 1)
 
 
-def _gather(grid: Tensor, guide: Tensor, cells: Cells, slopes: bool = False, counted: bool = False) -> Tensor:
-    """Return sum_cells w cell of a grid (B, C, v, u, d), (B, C, H, W).
+def _gather(
+    grid: Tensor, guide: Tensor, cells: Cells, slopes: tuple[bool, ...] = WEIGHT, counted: bool = False
+) -> list[Tensor]:
+    """Return sum_cells w cell of a grid (B, C, v, u, d), (B, C, H, W), once for all that is asked for.
 
     Args:
         grid: What is gathered.
         guide: As in `slice_grid`.
         cells: As in `slice_grid`.
-        slopes: Weigh with the slope of w in the guide.
+        slopes: Whether w are weights or their slopes, as `models.ops.grid_cells.pieces` takes it.
         counted: Leave out what is not above 0, and return also what the weights of the rest add up to,
             (B, 2 C, H, W).
     """
-    flat, channels = grid.flatten(2), grid.shape[1] * (1 + counted)
-    made = grid.new_zeros(grid.shape[0], channels, *guide.shape[2:])
-    for image, rows, taps in around(guide, cells, slopes):
-        some = made[image, :, rows]
-        total, counts = some[: grid.shape[1]], some[grid.shape[1] :]
-        for index, weight in taps:
-            values = flat[image].index_select(1, index).view_as(total)
+    batch, channels = grid.shape[:2]
+    flat = grid.transpose(0, 1).flatten(1)
+    flat = flat.clamp_min(0.0) if counted else flat
+    made = [grid.new_empty(channels * (1 + counted), batch, *guide.shape[2:]) for _ in slopes]
+    for piece in pieces(guide, cells, slopes):
+        # Row and column first, for both cells in depth; then depth, for all that is asked for.
+        sums = flat.new_zeros(2, channels * (1 + counted), *piece.depths[0].shape[1:])
+        for index, area, upper in piece.taps:
+            values = flat.index_select(1, index).view_as(sums[upper, :channels])
+            sums[upper, :channels].addcmul_(values, area)
             if counted:
-                counts.addcmul_(values.clamp_min_(0.0).sign(), weight)
-            total.addcmul_(values, weight)
-    return made
+                sums[upper, channels:].addcmul_(values.sign_(), area)
+        for part, depth in zip(made, piece.depths, strict=True):
+            part[:, piece.images, piece.rows] = (sums[0] * depth[0]).addcmul_(sums[1], depth[1])
+    return [part.transpose(0, 1) for part in made]
 
 
 def _create_exported(image: Tensor, guide: Tensor, cells: Cells) -> Tensor:

@@ -88,36 +88,56 @@ class _Side(NamedTuple):
     weight: Tensor
 
 
-Taps = Iterator[tuple[Tensor, Tensor]]
-"""Index into flattened cells and weight, of each of the eight cells around pixels."""
+Taps = Iterator[tuple[Tensor, Tensor, int]]
+"""Of each of the eight cells around pixels: index into flattened cells, weight in row and column, and 0 for
+the lower or 1 for the upper of two in depth."""
 
 
-def around(guide: Tensor, cells: Cells, slopes: bool = False) -> Iterator[tuple[int, slice, Taps]]:
-    """Return the cells around all pixels, piece by piece.
+WEIGHT, SLOPE = (False,), (True,)
+"""What may be asked for: weights, their slopes in the guide, or, as a sum of these, both."""
+
+
+class Piece(NamedTuple):
+    """Some pixels and the cells around them: h rows of n images.
+
+    Attributes:
+        images: Which of the batch.
+        rows: Which of their rows.
+        depths: Weights in depth, or slopes of these, as asked for, (2, n, h, W) each. Times the weight in row
+            and column it is the whole weight.
+        taps: The eight cells; indices (n * h * W,) into all cells of the batch, weights (h, W).
+    """
+
+    images: slice
+    rows: slice
+    depths: list[Tensor]
+    taps: Taps
+
+
+def pieces(guide: Tensor, cells: Cells, slopes: tuple[bool, ...] = WEIGHT) -> Iterator[Piece]:
+    """Return all pixels, piece by piece, with the cells around them.
 
     Args:
         guide: (B, 1, H, W).
         cells: Size of the cells.
-        slopes: Return slopes of the weights in the guide instead.
-
-    Returns:
-        Which of the batch, which of its rows, h in all, and for each of the eight cells the index (h * W,)
-        into those of one image and the weight (h, W).
+        slopes: What is asked for.
     """
     batch, _, height, width = guide.shape
     down, across = _side(height, cells.space, guide), _side(width, cells.space, guide)
-    _, columns, deep = cells.counts(guide)
+    counts = cells.counts(guide)
+    before = _before(guide, counts)
     limit = _CHUNK if guide.device.type == "cpu" else _CHUNK_DEVICE
-    step = max(1, limit // width)
+    together, step = max(1, limit // (height * width)), max(1, limit // width)
     for first in range(0, height, step):
         rows = slice(first, min(height, first + step))
-        planes = list(_planes(_Side(down.cell[:, rows], down.weight[:, rows]), across, columns, deep))
-        for image in range(batch):
-            taps = _eight(guide[image, 0, rows], planes, deep, slopes)
-            yield image, rows, ((index.flatten(), weight) for index, weight in taps)
+        planes = _planes(_Side(down.cell[:, rows], down.weight[:, rows]), across, counts)
+        for image in range(0, batch, together):
+            images = slice(image, min(batch, image + together))
+            low, depths = _depths(guide[images, 0, rows], counts[2], slopes)
+            yield Piece(images, rows, depths, _taps(low + before[images], planes))
 
 
-def around_all(guide: Tensor, cells: Cells) -> Taps:
+def around_all(guide: Tensor, cells: Cells) -> Iterator[tuple[Tensor, Tensor]]:
     """Return the cells around all pixels at once, in a form that a recorded graph can hold for every size.
 
     Args:
@@ -125,13 +145,19 @@ def around_all(guide: Tensor, cells: Cells) -> Taps:
         cells: Size of the cells.
 
     Returns:
-        Index (B * H * W,) into the cells of the whole batch, and weight (B * H * W, 1).
+        Index (B * H * W,) into all cells of the batch, and weight (B * H * W, 1).
     """
     down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
-    rows, columns, deep = cells.counts(guide)
-    before = torch.arange(guide.shape[0], device=guide.device)[:, None, None] * (rows * columns * deep)
-    for index, weight in _eight(guide[:, 0], list(_planes(down, across, columns, deep)), deep, False):
-        yield (index + before).reshape(-1), weight.reshape(-1, 1)
+    counts = cells.counts(guide)
+    low, depths = _depths(guide[:, 0], counts[2], WEIGHT)
+    for index, area, upper in _taps(low + _before(guide, counts), _planes(down, across, counts)):
+        yield index, (area * depths[0][upper]).reshape(-1, 1)
+
+
+def _before(guide: Tensor, counts: tuple[int, int, int]) -> Tensor:
+    """Return the number of cells of all images before each of the batch, (B, 1, 1)."""
+    images = torch.arange(guide.shape[0], device=guide.device)[:, None, None]
+    return images * (counts[0] * counts[1] * counts[2])
 
 
 def _side(count: int, space: int, like: Tensor) -> _Side:
@@ -142,12 +168,17 @@ def _side(count: int, space: int, like: Tensor) -> _Side:
     return _Side(torch.where(below, cell, cell - 1).clamp_min(0), weight)
 
 
-def _planes(down: _Side, across: _Side, columns: int, deep: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _planes(down: _Side, across: _Side, counts: tuple[int, int, int]) -> list[tuple[Tensor, Tensor]]:
     """Return, of four stacks of cells, index of the first and weight of all, (rows, columns)."""
-    for v in range(2):
-        for u in range(2):
-            index = (down.cell[v, :, None] * columns + across.cell[u]) * deep
-            yield index, down.weight[v, :, None] * across.weight[u]
+    _, columns, deep = counts
+    return [
+        (
+            (down.cell[v, :, None] * columns + across.cell[u]) * deep,
+            down.weight[v, :, None] * across.weight[u],
+        )
+        for v in range(2)
+        for u in range(2)
+    ]
 
 
 def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,18 +187,20 @@ def _tent(distance: Tensor) -> tuple[Tensor, Tensor]:
     return (1.0 - rounded).clamp_min(0.0), rounded
 
 
-def _eight(guide: Tensor, planes: list[tuple[Tensor, Tensor]], deep: int, slopes: bool) -> Taps:
-    """Return index and weight, or its slope, (..., rows, columns), for guides of that shape."""
+def _depths(guide: Tensor, deep: int, slopes: tuple[bool, ...]) -> tuple[Tensor, list[Tensor]]:
+    """Return the lower of the two cells in depth, and what is asked for of both."""
     place = guide * (deep / LEVELS) + (0.5 * deep / LEVELS - 0.5)
     # At the ends of the guide there is one cell only; the tent is 0 at the other of these two.
     low = torch.nan_to_num(torch.floor(place).clamp(0.0, deep - 2.0), 0.0)
     near = place - low
     near = torch.stack([near, near - 1.0])
-    depth, rounded = _tent(near)
-    if slopes:
-        depth = near / rounded * (depth > 0) * (-deep / LEVELS)
-    low = low.long()
+    tent, rounded = _tent(near)
+    depths = [near / rounded * (tent > 0) * (-deep / LEVELS) if slope else tent for slope in slopes]
+    return low.long(), depths
+
+
+def _taps(low: Tensor, planes: list[tuple[Tensor, Tensor]]) -> Taps:
     for first, area in planes:
-        index = low + first
-        yield index, area * depth[0]
-        yield index + 1, area * depth[1]
+        index = (low + first).reshape(-1)
+        yield index, area, 0
+        yield index + 1, area, 1
