@@ -138,13 +138,16 @@ class _Create(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         image, guide, grid, divisor = ctx.saved_tensors
         for_image, for_guide = ctx.needs_input_grad[:2]
-        share, d_image, d_guide = gradient / divisor, None, None
+        channels, d_image, d_guide = grid.shape[1], None, None
+        # h and <h, c> side by side, channels outermost in memory as `_gather` reads them.
+        both = grid.new_zeros(channels + 1, grid.shape[0], *grid.shape[2:]).transpose(0, 1)
+        share, product = both[:, :channels], both[:, channels]
+        torch.div(gradient, divisor, out=share)
         if for_image:
             d_image = _limited(_gather(share, guide, ctx.cells)[0], ctx.limit)
         if for_guide:
-            both = torch.cat([share, share[:, :1] * grid[:, :1]], 1)
-            for channel in range(1, grid.shape[1]):
-                both[:, -1].addcmul_(share[:, channel], grid[:, channel])
+            for channel in range(channels):
+                product.addcmul_(share[:, channel], grid[:, channel])
             steep = _gather(both, guide, ctx.cells, SLOPE)[0]
             d_guide = (steep[:, :-1] * image).sum(1, keepdim=True).sub_(steep[:, -1:])
             d_guide = _limited(d_guide, ctx.limit)
@@ -190,8 +193,9 @@ def _scatter(values: Tensor, guide: Tensor, cells: Cells) -> Tensor:
     for piece in pieces(guide, cells):
         some = values[piece.images, :, piece.rows].transpose(0, 1)
         parts = [some * depth for depth in piece.depths[0]]
-        for index, area, upper in piece.taps:
-            sums.index_add_(1, index, (parts[upper] * area).flatten(1))
+        for index, area in piece.taps:
+            for upper, part in enumerate(parts):
+                sums[:, upper:].index_add_(1, index, (part * area).flatten(1))
     return sums.unflatten(1, (batch, *counts)).transpose(0, 1)
 
 
@@ -215,11 +219,12 @@ def _gather(
     for piece in pieces(guide, cells, slopes):
         # Row and column first, for both cells in depth; then depth, for all that is asked for.
         sums = flat.new_zeros(2, channels * (1 + counted), *piece.depths[0].shape[1:])
-        for index, area, upper in piece.taps:
-            values = flat.index_select(1, index).view_as(sums[upper, :channels])
-            sums[upper, :channels].addcmul_(values, area)
-            if counted:
-                sums[upper, channels:].addcmul_(values.sign_(), area)
+        for index, area in piece.taps:
+            for upper, some in enumerate(sums):
+                values = flat[:, upper:].index_select(1, index).view_as(some[:channels])
+                some[:channels].addcmul_(values, area)
+                if counted:
+                    some[channels:].addcmul_(values.sign_(), area)
         for part, depth in zip(made, piece.depths, strict=True):
             part[:, piece.images, piece.rows] = (sums[0] * depth[0]).addcmul_(sums[1], depth[1])
     return [part.transpose(0, 1) for part in made]

@@ -88,9 +88,9 @@ class _Side(NamedTuple):
     weight: Tensor
 
 
-Taps = Iterator[tuple[Tensor, Tensor, int]]
-"""Of each of the eight cells around pixels: index into flattened cells, weight in row and column, and 0 for
-the lower or 1 for the upper of two in depth."""
+Taps = Iterator[tuple[Tensor, Tensor]]
+"""Of each of four pairs of cells around pixels: index of the lower one into flattened cells, after which the
+upper one follows, and weight of both in row and column."""
 
 
 WEIGHT, SLOPE = (False,), (True,)
@@ -103,9 +103,9 @@ class Piece(NamedTuple):
     Attributes:
         images: Which of the batch.
         rows: Which of their rows.
-        depths: Weights in depth, or slopes of these, as asked for, (2, n, h, W) each. Times the weight in row
-            and column it is the whole weight.
-        taps: The eight cells; indices (n * h * W,) into all cells of the batch, weights (h, W).
+        depths: Weights of both in depth, or slopes of these, as asked for, (2, n, h, W). Times the weight
+            in row and column it is the whole weight.
+        taps: The cells; indices (n * h * W,) into all cells of the batch, weights (h, W).
     """
 
     images: slice
@@ -150,8 +150,9 @@ def around_all(guide: Tensor, cells: Cells) -> Iterator[tuple[Tensor, Tensor]]:
     down, across = _side(guide.shape[2], cells.space, guide), _side(guide.shape[3], cells.space, guide)
     counts = cells.counts(guide)
     low, depths = _depths(guide[:, 0], counts[2], WEIGHT)
-    for index, area, upper in _taps(low + _before(guide, counts), _planes(down, across, counts)):
-        yield index, (area * depths[0][upper]).reshape(-1, 1)
+    for index, area in _taps(low + _before(guide, counts), _planes(down, across, counts)):
+        for upper in range(2):
+            yield index + upper, (area * depths[0][upper]).reshape(-1, 1)
 
 
 def _before(guide: Tensor, counts: tuple[int, int, int]) -> Tensor:
@@ -201,6 +202,4 @@ def _depths(guide: Tensor, deep: int, slopes: tuple[bool, ...]) -> tuple[Tensor,
 
 def _taps(low: Tensor, planes: list[tuple[Tensor, Tensor]]) -> Taps:
     for first, area in planes:
-        index = (low + first).reshape(-1)
-        yield index, area, 0
-        yield index + 1, area, 1
+        yield (low + first).reshape(-1), area
