@@ -72,6 +72,8 @@ class Denoiser(nn.Module):
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         exported_bytes_per_pixel: `bytes_per_pixel` of exported files, where it is more than half as much
             again; 0: it is not.
+        rounding_reach: Pixels around one whose rounding it may have: where weights or images are subtracted,
+            what is left beside a firefly is rounded as the firefly is. See `trainer.export.parity`.
         no_export: Why the method is not exported as ONNX or TorchScript; empty where it is.
         targets: Names of the buffers that training compares with.
         compared: Names of the pairs that `training_pairs` returns.
@@ -90,6 +92,7 @@ class Denoiser(nn.Module):
     bytes_per_pixel: int = 500
     bytes_once: int = 0
     exported_bytes_per_pixel: int = 0
+    rounding_reach: int = 4
     no_export: str = ""
     targets: tuple[str, ...] = ("reference",)
     compared: tuple[str, ...] = ("color",)

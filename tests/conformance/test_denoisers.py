@@ -21,10 +21,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
-KERNEL_METHODS = {"KP", "KPCN", "WSKP", "MultiResolutionWSKP", "JointBilateral", "SBMC", *LAYERS}
+KERNEL_METHODS = {"KP", "KPCN", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "SBMC", *LAYERS}
 """Outputs are sums of input pixels whose weights sum to 1: a constant image stays constant."""
 
-CLEANING = {"ACFM", "AFGSA", "KPCN", "SBMC", *LAYERS}
+CLEANING = {"ACFM", "AFGSA", "KPCN", "NBGD", "SBMC", *LAYERS}
 """Methods that take radiance which is negative, infinite or not a number; the data module repairs it for the
 others."""
 

@@ -21,10 +21,8 @@ from trainer.export.entry import Sampled, example, numbers
 LIMIT = 1e-4
 ROUNDING = 2.0
 """How much less exact than eager an artifact may be where float32 itself rounds by more than the limit."""
-AROUND = 4
-"""Pixels around one among which eager's rounding is sought, on each side."""
 UNUSABLE = 1e-2
-"""An error that no rounding excuses."""
+"""An error, relative to the brightest of the pixels around, that no rounding excuses."""
 SIZES = ((1, 17, 31), (2, 63, 50), (1, 128, 128), (2, 45, 80), (3, 16, 97))
 """(batch, height, width): none is the size that was traced, most are odd."""
 COUNTS = (3, 8, 1, 2, 5)
@@ -68,18 +66,34 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
             expected = denoiser(buffers).color
             try:
                 found = artifact(buffers).color
-                error = relative_error(found, expected)
+                error, own = agreement(denoiser, buffers, found, expected, limit)
             except Exception as failure:
                 raise ValueError(f"the exported file does not run at {place}: {failure}") from failure
-            if not error <= limit:
-                own = _as_exact(found, expected, _in_double(denoiser, buffers))
-                if own is None:
-                    raise ValueError(
-                        f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}"
-                    )
-                rounding = max(rounding, own)
+            if own is None:
+                raise ValueError(f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}")
+            rounding = max(rounding, own)
             worst = max(worst, error)
     return Parity(worst, limit, SIZES, runtime, rounding, COUNTS if denoiser.per_sample else ())
+
+
+def agreement(
+    denoiser: Denoiser, buffers: Mapping[str, Tensor], found: Tensor, expected: Tensor, limit: float = LIMIT
+) -> tuple[float, float | None]:
+    """Return how far an artifact's image is from eager's, and the rounding that excuses it.
+
+    The rounding is 0 where the error is within the limit, and None where nothing excuses it.
+
+    Args:
+        denoiser: What the artifact was made from.
+        buffers: Its input.
+        found: The artifact's image.
+        expected: Eager's.
+        limit: Largest error that needs no excuse.
+    """
+    error = relative_error(found, expected)
+    if error <= limit:
+        return error, 0.0
+    return error, _as_exact(found, expected, _in_double(denoiser, buffers), denoiser.rounding_reach)
 
 
 def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
@@ -88,7 +102,7 @@ def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
     return copy.deepcopy(denoiser).double()(wide).color
 
 
-def _as_exact(found: Tensor, eager: Tensor, exact: Tensor) -> float | None:
+def _as_exact(found: Tensor, eager: Tensor, exact: Tensor, reach: int) -> float | None:
     """Return eager's error against float64 where the artifact's is not much larger, otherwise None.
 
     Not much larger than the largest of the image, relative to pixels; or at no pixel than the largest
@@ -96,11 +110,15 @@ def _as_exact(found: Tensor, eager: Tensor, exact: Tensor) -> float | None:
     """
     found, eager = found.double(), eager.double()
     own, theirs = relative_error(eager, exact), relative_error(found, exact)
-    if not max(ROUNDING * own, theirs) < UNUSABLE:
+
+    def around(image: Tensor) -> Tensor:
+        return F.max_pool2d(image, 2 * reach + 1, 1, reach)
+
+    apart = torch.maximum((found - exact).abs(), ROUNDING * (eager - exact).abs())
+    if not bool((apart < UNUSABLE * around(_scale(exact))).all()):
         return None
-    noise = (eager - exact).abs().amax(1, keepdim=True)
-    around = F.max_pool2d(noise, 2 * AROUND + 1, 1, AROUND)
-    bound = torch.maximum(ROUNDING * around, LIMIT * _scale(exact))
+    noise = around((eager - exact).abs().amax(1, keepdim=True))
+    bound = torch.maximum(ROUNDING * noise, LIMIT * _scale(exact))
     return own if theirs <= ROUNDING * own or bool(((found - exact).abs() <= bound).all()) else None
 
 
