@@ -80,7 +80,8 @@ class Training:
     def one_process(self, shards: Path) -> None:
         """Train on the batches of both ranks in turn, two for each step."""
         data = ["--data", "tests.end_to_end.ddp_modules.Interleaved", "--data.init_args.root", str(shards)]
-        command = [sys.executable, "-m", "trainer", *self.options, *data]
+        module = ["--model", "tests.end_to_end.ddp_modules.HalvedGradients"]
+        command = [sys.executable, "-m", "trainer", *self.options, *data, *module]
         self.wait(self.start([*command, "--trainer.accumulate_grad_batches", "2"]))
 
     def two_ranks(self, shards: str) -> subprocess.Popen[bytes]:
