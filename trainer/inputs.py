@@ -97,7 +97,7 @@ def advice(model: Model, has: Collection[str]) -> str:
         )
     absent = [name for name in missing if name not in has and name != "color"]
     used = getattr(model, "features", None)
-    if absent and "features" in options and used is not None:
+    if absent and "features" in options and isinstance(used, (tuple, list)) and set(absent) <= set(used):
         rest = spelled([name for name in used if name not in absent])
         found.append(f"--option features={rest} does without {', '.join(absent)}")
     return "; ".join(found)
