@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import trainer.modules
-from tests.configs.test_configs import SAMPLES, TRAINED, arguments
+from tests.configs.test_configs import OVERLAYS, TRAINED, arguments
 from trainer import configs
 
-NAMES = [name for name in TRAINED if name not in SAMPLES]
+NAMES = [name for name in TRAINED if name not in OVERLAYS]
 OVERLAY = """
 model:
   init_args:
