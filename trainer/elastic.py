@@ -4,18 +4,26 @@ The workers of every attempt meet in one store that torchrun's agent keeps. With
 what the workers of the attempt before wrote, so a worker that is early connects to one that was killed: the
 restart fails, or waits for half an hour. Here all of an attempt agree on a name first, under which the store
 is empty.
+
+Before each batch the ranks of Lightning 2.6 tell each other of SIGTERM, and whatever fails meanwhile is
+passed over. That the process of a data loader has died is raised by the handler of a signal, in the middle of
+anything: there it would be lost, its rank would not have spoken, and all ranks would wait for ever.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 import uuid
 from datetime import timedelta
+from functools import partial
 
+import torch
 import torch.distributed as dist
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import ParallelStrategy
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 PATIENCE = timedelta(minutes=10)
 """How long the ranks wait for each other to start; nodes may load at different speeds."""
@@ -42,6 +50,26 @@ def join_ranks(trainer: Trainer) -> None:
     if backend is None:
         backend = "nccl" if strategy.root_device.type == "cuda" else "gloo"
     dist.init_process_group(backend, store=dist.PrefixStore(name, store), rank=rank, world_size=world)
+
+
+def heed_failures(trainer: Trainer) -> None:
+    """Let what fails while ranks tell each other of SIGTERM end the process, so that all start again."""
+    if trainer.world_size > 1:
+        trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = partial(tell_sigterm, trainer)  # type: ignore[method-assign]
+
+
+def tell_sigterm(trainer: Trainer) -> None:
+    """Find out whether the first rank was asked to end; then all end.
+
+    Raises:
+        SIGTERMException: It was.
+    """
+    told = torch.tensor([int(trainer.received_sigterm)], device=trainer.strategy.root_device)
+    dist.broadcast(told, src=0)
+    if told.item():
+        with contextlib.suppress(Exception):
+            dist.barrier()  # all have heard of it
+        raise SIGTERMException
 
 
 def agree(store: dist.Store, rank: int, world: int, patience: timedelta) -> str:

@@ -24,7 +24,7 @@ from trainer.callbacks.alive import Alive
 from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.recorder import RunRecorder
 from trainer.callbacks.same_start import SameStart
-from trainer.elastic import join_ranks
+from trainer.elastic import heed_failures, join_ranks
 from trainer.tracking import MLflowTracking
 
 TRACKING = "trainer.tracking.MLflowTracking"
@@ -277,6 +277,7 @@ class TrainingCLI(LightningCLI):
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
         join_ranks(self.trainer)
+        heed_failures(self.trainer)
         more = [SameStart()] * (self.trainer.world_size > 1) + [Alive()] * bool(os.environ.get(ALIVE))
         self.trainer.callbacks.extend(more)  # type: ignore[attr-defined]  # Lightning types it on use
 

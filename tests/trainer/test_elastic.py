@@ -6,9 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch.distributed as dist
+from lightning.pytorch.loops.training_epoch_loop import _TrainingEpochLoop
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from trainer.callbacks.same_start import SameStart
-from trainer.elastic import agree
+from trainer.elastic import agree, heed_failures
 
 
 def attempt(store, ranks, world, patience=timedelta(seconds=20)):
@@ -83,3 +85,42 @@ def test_ranks_that_begin_from_different_steps_are_refused(monkeypatch, steps, t
     with pytest.raises(ValueError, match="different checkpoints") as refused:
         SameStart().on_train_start(trainer, None)
     assert told in str(refused.value)
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """A trainer of two ranks whose loop tells of SIGTERM as ours do, and what that told."""
+    heard = []
+
+    def broadcast(tensor, src):
+        heard.append(int(tensor))
+
+    monkeypatch.setattr(dist, "broadcast", broadcast)
+    monkeypatch.setattr(dist, "barrier", lambda: None)
+    loop = SimpleNamespace(epoch_loop=SimpleNamespace())
+    strategy = SimpleNamespace(root_device="cpu")
+    trainer = SimpleNamespace(world_size=2, fit_loop=loop, strategy=strategy, received_sigterm=False)
+    heed_failures(trainer)
+    return trainer, heard
+
+
+def test_ranks_tell_each_other_of_sigterm_before_each_batch(told):
+    trainer, heard = told
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor()
+    trainer.received_sigterm = True
+    with pytest.raises(SIGTERMException):
+        trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor()
+    assert heard == [0, 1]
+
+
+def test_death_of_a_reader_while_ranks_tell_each_other_of_sigterm_is_not_passed_over(told, monkeypatch):
+    def fails(tensor, src):
+        raise RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed.")
+
+    monkeypatch.setattr(dist, "broadcast", fails)
+    with pytest.raises(RuntimeError, match="DataLoader worker"):
+        told[0].fit_loop.epoch_loop._broadcast_sigterm_tensor()
+
+
+def test_lightning_has_what_is_replaced():
+    assert "_broadcast_sigterm_tensor" in vars(_TrainingEpochLoop)
