@@ -24,7 +24,8 @@ trainer: {logger: false, callbacks: [], enable_checkpointing: false, accelerator
 
 STEPS = {"nbgd7_bmfr.yaml": 1}
 """Steps of those that do not train three. Pixels change from one cell of a bilateral grid to the next: with
-seven layers before it, rounding of one step in 60,000 of a move is one in 2,000 after two, in 900 after three."""
+seven layers before it, rounding by 1/60,000 of a move in one step is 1/2,000 after two and 1/900 after three.
+"""
 
 
 def job(name, overlay):
