@@ -140,6 +140,10 @@ def follow(ray: Any, board: Any, job: Any) -> tuple[int, str]:
         raise
 
 
+ON_HEAD = {"node:__internal_head__": 0.001}
+"""Keeps a process on the cluster's first node, without which there is no cluster; any other may be lost."""
+
+
 def conduct(cluster: Cluster, conductor: type, *arguments: Any) -> int:
     """Run a job in a cluster and print what it prints; returns its exit code.
 
@@ -154,8 +158,8 @@ def conduct(cluster: Cluster, conductor: type, *arguments: Any) -> int:
         KeyboardInterrupt: Ctrl-C, after the job was cancelled.
     """
     with connected(cluster) as ray:
-        board = ray.remote(num_cpus=0)(Board).remote()
-        head = ray.remote(num_cpus=0)(conductor).remote()
+        board = ray.remote(num_cpus=0, resources=ON_HEAD)(Board).remote()
+        head = ray.remote(num_cpus=0, resources=ON_HEAD)(conductor).remote()
         try:
             code, message = follow(ray, board, head.run.remote(*arguments, board))
         finally:
