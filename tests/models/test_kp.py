@@ -11,6 +11,7 @@ import torch
 from models import KP
 from models.kp import PRESETS
 from models.ops import streaming
+from tests.models.behaviour import assert_bfloat16_stays_near_float32, losses_of
 from tests.models.frames import largest_relative, noisy_edges, random_buffers
 from tests.models.plain_kp import plain_kp, plain_logits, unfold_gather
 from trainer.losses import SMAPE
@@ -119,30 +120,16 @@ def test_exposure_and_depth_range_reach_the_network() -> None:
 
 def test_bfloat16_stays_near_float32() -> None:
     torch.manual_seed(4)
-    network, buffers = KP().eval(), random_buffers(1, 32, 32)
-    with torch.no_grad():
-        expected = network(buffers).color
-        with torch.autocast("cpu", torch.bfloat16):
-            found = network(buffers).color
-    assert found.dtype == torch.float32
-    assert (found - expected).abs().mean() < 0.02 * expected.abs().mean()
+    assert_bfloat16_stays_near_float32(KP().eval(), random_buffers(1, 32, 32))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_form_learns_to_filter_along_edges(preset: str) -> None:
     torch.manual_seed(5)
     network, loss = KP(**PRESETS[preset]), SMAPE()
-    optimizer = torch.optim.Adam(network.parameters(), 2e-3)
     buffers, reference = noisy_edges(2, 32, 32)
     noisy = loss(buffers["irradiance"] * buffers["albedo"], reference).item()
-    losses = []
-    for _ in range(30):
-        optimizer.zero_grad()
-        value = loss(network(buffers).color, reference)
-        value.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        losses.append(value.item())
+    losses = losses_of(network, lambda: loss(network(buffers).color, reference), 30, clip=1.0)
     assert losses[-1] < 0.6 * min(losses[0], noisy)
 
 

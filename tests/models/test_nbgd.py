@@ -13,6 +13,7 @@ from torch import Tensor
 from models import NBGD
 from models.denoiser import select
 from models.ops.outliers import replace_outliers
+from tests.models.behaviour import losses_of
 from tests.models.frames import largest_relative, random_buffers, split_buffers
 from tests.models.plain_nbgd import filmic, gamma, outputs, plain_nbgd
 from trainer.export import SUFFIXES, export, load_artifact
@@ -257,15 +258,12 @@ def test_it_learns_to_keep_stripes_apart_in_noisy_light(layers: int) -> None:
     batch = stripes()
     torch.manual_seed(0)
     network, loss = NBGD(layers), L1()
-    optimizer = torch.optim.Adam(network.parameters(), 2e-3)
-    losses = []
-    for _ in range(40):
+
+    def compared() -> Tensor:
         pair = network.training_pairs(batch)["color"]
-        value = loss(pair.output, pair.target)
-        optimizer.zero_grad()
-        value.backward()
-        optimizer.step()
-        losses.append(value.item())
+        return loss(pair.output, pair.target)
+
+    losses = losses_of(network, compared, 40, clip=None)
     assert losses[-1] < 0.5 * losses[0]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.outputs import replacing, write_whole
+from trainer.reports.front import on_front
 
 FINISHED, STOPPED, FAILED, RUNNING = "finished", "stopped", "failed", "interrupted"
 
@@ -50,19 +51,10 @@ def ranked(trials: Sequence[Trial], mode: str) -> list[Trial]:
     """
     sign = -1.0 if mode == "max" else 1.0
 
-    def points(trial: Trial) -> tuple[float, float]:
-        return sign * trial.score, trial.cost
-
     trained = [t for t in trials if t.state == FINISHED and not math.isnan(t.score)]
-
-    def beaten(trial: Trial) -> bool:
-        mine = points(trial)
-        return any(
-            theirs != mine and theirs[0] <= mine[0] and theirs[1] <= mine[1]
-            for theirs in map(points, trained)
-        )
-
-    marked = [replace(trial, best=trial in trained and not beaten(trial)) for trial in trials]
+    flags = on_front([(sign * trial.score, trial.cost) for trial in trained])
+    best = {trial.name for trial, on in zip(trained, flags, strict=True) if on}
+    marked = [replace(trial, best=trial.name in best) for trial in trials]
     order = {FINISHED: 0, STOPPED: 1, RUNNING: 2, FAILED: 3}
     return sorted(marked, key=lambda t: (order[t.state], math.isnan(t.score), sign * t.score, t.name))
 

@@ -20,6 +20,7 @@ from trainer.evaluation.plan import INPUT
 from trainer.evaluation.tables import Scored
 from trainer.metrics.measures import SCORES
 from trainer.outputs import replacing
+from trainer.reports.front import on_front
 
 SUFFIXES = (".png", ".pdf")
 
@@ -240,11 +241,9 @@ def _short(label: str) -> str:
 
 def pareto(points: Sequence[tuple[float, float]], higher: bool) -> list[tuple[float, float]]:
     """Return the points (time, value) that no other one beats in both, by time."""
-    front: list[tuple[float, float]] = []
-    for time, value in sorted(points, key=lambda p: (p[0], -p[1] if higher else p[1])):
-        if not front or (value > front[-1][1] if higher else value < front[-1][1]):
-            front.append((time, value))
-    return front
+    sign = -1.0 if higher else 1.0
+    flags = on_front([(time, sign * value) for time, value in points])
+    return sorted({point for point, on in zip(points, flags, strict=True) if on})
 
 
 def _seconds(rows: pd.DataFrame, label: str, costs: Mapping[str, Mapping[str, Any]]) -> float:
