@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from trainer import configs
 
@@ -152,14 +153,22 @@ class Launch:
         restarts: Whether this is a restart, as far as that can be told.
         unfinished: Continue a run of the same identity that did not finish, even if nothing says that this is
             a restart: who names a launch means that.
-        once: Where a run of the same identity is finished there is nothing left to do: a restart came for a
-            process that died after the end of the training.
+        since: When this launch began, in seconds since 1970, as far as that is known; a run that ended before
+            is that of an earlier launch of the same name.
     """
 
     identity: str
     restarts: bool = False
     unfinished: bool = False
-    once: bool = False
+    since: float = 0.0
+
+    @property
+    def once(self) -> bool:
+        """Whether there is nothing left to do where a run of the same identity is finished.
+
+        A restart may have come for a process that died after the end of the training.
+        """
+        return self.restarts or self.identity.startswith(SUBMITTED)
 
 
 def current_launch(
@@ -175,28 +184,34 @@ def current_launch(
         arguments: Its command line without the program, that of `sys.argv` where None.
     """
     if training := environment.get(TRAINING_VARIABLE):
-        return Launch(training, unfinished=True, once=training.startswith(SUBMITTED))
+        return Launch(training, unfinished=True)
     what = _digest(sys.argv[1:] if arguments is None else arguments)
     restarts = environment.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+    since = _agent().create_time() if restarts else 0.0
     if named := environment.get(LAUNCH_VARIABLE):
-        return Launch(f"{named} {what}", unfinished=True, once=restarts)
+        return Launch(f"{named} {what}", restarts, unfinished=True, since=since)
     torchrun = environment.get("TORCHELASTIC_RUN_ID")
     if torchrun and torchrun != "none":  # its default
-        return Launch(f"torchrun {torchrun} {what}", restarts, unfinished=True, once=restarts)
+        return Launch(f"torchrun {torchrun} {what}", restarts, unfinished=True, since=since)
     if "SLURM_JOB_ID" in environment:
-        restarts = restarts or environment.get("SLURM_RESTART_COUNT", "0") != "0"
-        return Launch(f"slurm {environment['SLURM_JOB_ID']} {what}", restarts, once=restarts)
+        requeued = environment.get("SLURM_RESTART_COUNT", "0") != "0"
+        return Launch(f"slurm {environment['SLURM_JOB_ID']} {what}", restarts or requeued)
     if torchrun and environment.get("WORLD_SIZE") != environment.get("LOCAL_WORLD_SIZE"):
         if environment.get("RANK") == "0":
             _warn_of_nameless_launch()
         return None
     if torchrun:
-        import psutil
-
-        agent = psutil.Process(os.getppid())
+        agent = _agent()
         place = f"{socket.gethostname()} {agent.pid} {agent.create_time():.2f}"
-        return Launch(f"torchrun {place} {what}", restarts, once=restarts)
+        return Launch(f"torchrun {place} {what}", restarts)
     return None
+
+
+def _agent() -> Any:
+    """Return the process of torchrun that started this one."""
+    import psutil
+
+    return psutil.Process(os.getppid())
 
 
 def _digest(arguments: Sequence[str]) -> str:
@@ -276,7 +291,9 @@ def run_of_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
 
 def finished_by_launch(launch: Launch, root: Path, experiment: str) -> Path | None:
     """Return the run folder that shows that a launch has nothing left to do, None where it has."""
-    return _noted_as(launch, root, experiment, finished=True) if launch.once else None
+    folder = _noted_as(launch, root, experiment, finished=True) if launch.once else None
+    ended = (folder / LAUNCH_FILE).stat().st_mtime if folder is not None else 0.0
+    return folder if ended >= launch.since else None
 
 
 def _noted_as(launch: Launch, root: Path, experiment: str, finished: bool) -> Path | None:

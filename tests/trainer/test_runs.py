@@ -103,15 +103,26 @@ def test_finished_run_is_not_continued_by_its_launch(tmp_path):
     assert run_of_launch(Launch("a", restarts=True, unfinished=True), tmp_path, "exp") is None
 
 
-@pytest.mark.parametrize("once", [True, False])
-def test_restart_of_a_finished_training_has_nothing_left_to_do(tmp_path, once):
-    launch = Launch("a", restarts=True, once=once)
+@pytest.mark.parametrize(
+    ("launch", "once"),
+    [(Launch("a", restarts=True), True), (Launch("a", unfinished=True), False), (Launch("submit a"), True)],
+)
+def test_restart_of_a_finished_training_has_nothing_left_to_do(tmp_path, launch, once):
     run = make_run(tmp_path, "20260101-000000")
     begin_launch(run, launch)
     assert finished_by_launch(launch, tmp_path, "exp") is None
     end_launch(run)
     assert finished_by_launch(launch, tmp_path, "exp") == (run if once else None)
-    assert finished_by_launch(Launch("b", once=True), tmp_path, "exp") is None
+    assert finished_by_launch(Launch("b", restarts=True), tmp_path, "exp") is None
+
+
+def test_restart_does_not_take_the_run_of_an_earlier_launch_of_its_name_for_its_own(tmp_path):
+    run = make_run(tmp_path, "20260101-000000")
+    begin_launch(run, Launch("a"))
+    end_launch(run)
+    ended = (run / "launch.json").stat().st_mtime
+    assert finished_by_launch(Launch("a", restarts=True, since=ended - 60), tmp_path, "exp") == run
+    assert finished_by_launch(Launch("a", restarts=True, since=ended + 60), tmp_path, "exp") is None
 
 
 @pytest.mark.parametrize(
@@ -207,7 +218,7 @@ def test_place_of_installation_does_not_matter_to_a_launch(tmp_path, monkeypatch
 def test_named_training_is_the_same_whatever_its_command_line():
     environment = {"PENUMBRA_TRAINING": "submit 1", "PENUMBRA_LAUNCH": "x", "TORCHELASTIC_RUN_ID": "job"}
     for arguments in ([], ["fit", "--config", "scratch/a.yaml"]):
-        assert current_launch(environment, arguments) == Launch("submit 1", unfinished=True, once=True)
+        assert current_launch(environment, arguments) == Launch("submit 1", unfinished=True)
 
 
 def test_torchrun_without_an_identity_is_known_by_its_process_on_one_machine_only(capsys):

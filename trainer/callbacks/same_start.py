@@ -21,8 +21,6 @@ class SameStart(Callback):
         Raises:
             ValueError: Some ranks begin from other steps; on all ranks.
         """
-        if trainer.world_size == 1 or not dist.is_initialized():
-            return
         steps: list[Any] = [None] * trainer.world_size
         dist.all_gather_object(steps, trainer.global_step)
         if len(set(steps)) > 1:

@@ -85,6 +85,8 @@ def share_newest(root: Path, experiment: str, storage: str | None) -> bool:
     gathered: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(gathered, (mine, done))
     if any(finished for _, finished in gathered):
+        if rank == 0:
+            print("restarted: the run is finished, nothing is left to do", file=sys.stderr)
         return True
     states = [state for state, _ in gathered]
     furthest = max(states)
