@@ -38,12 +38,14 @@ class Decision:
         version: The best one.
         before: The champion so far, None where there was none.
         reasons: Why it does not become it; empty where it does, or is it already.
+        alone: Scenes in which the champion so far has no value, so that nothing could be compared.
     """
 
     name: str
     version: str
     before: str | None
     reasons: tuple[str, ...] = ()
+    alone: tuple[str, ...] = ()
 
     @property
     def moves(self) -> bool:
@@ -56,7 +58,9 @@ class Decision:
         if self.version == self.before:
             return f"{what} stays the champion"
         if self.moves:
-            return f"{what} is the champion now" + (f", version {self.before} was" if self.before else "")
+            was = f", version {self.before} was" if self.before else ""
+            lacks = f", which has no value in {', '.join(self.alone)}" if self.alone else ""
+            return f"{what} is the champion now{was}{lacks}"
         return f"version {self.before} stays the champion of {self.name}: {what} {'; '.join(self.reasons)}"
 
 
@@ -141,15 +145,15 @@ def decide(
     old = next((entry for entry in entries if entry.version == before), None)
     if old is None or best.version == before:
         return Decision(name, best.version, before)
-    reasons = []
+    reasons, alone = [], []
     for scene in scored.scenes:
         mine, theirs = (scored.cell(entry.label, metric, scene) for entry in (best, old))
-        if not theirs.count or theirs.missing:
-            continue  # the champion failed where the other one did not
         worse = theirs.mean - mine.mean if higher else mine.mean - theirs.mean
         if worse > tolerance * abs(theirs.mean):
             reasons.append(f"is worse in {scene}: {metric} {mine.text()}, champion {theirs.text()}")
-    return Decision(name, best.version, before, tuple(reasons))
+        if not theirs.count:
+            alone.append(scene)
+    return Decision(name, best.version, before, tuple(reasons), tuple(alone))
 
 
 def move(decision: Decision, uri: str) -> None:

@@ -44,6 +44,12 @@ def test_a_champion_that_is_equalled_stays():
         assert (decision.version, decision.moves) == ("1", False)
 
 
+def test_a_scene_that_the_champion_lacks_is_told():
+    decision = decide(scored([float("nan"), 30], [1, 31]), VERSIONS, "1", "psnr_wskp", 0.0)
+    assert decision.moves
+    assert "version 1 was, which has no value in s" in decision.text()
+
+
 def test_the_first_champion_is_the_best_one():
     decision = decide(scored([20, 30], [25, 29.5]), VERSIONS, None, "psnr_wskp", 0.0)
     assert (decision.moves, decision.version) == (True, "2")
