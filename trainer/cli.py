@@ -6,6 +6,7 @@ import argparse
 import difflib
 import importlib
 import importlib.util
+import io
 import os
 import re
 import signal
@@ -80,6 +81,8 @@ def main() -> int:
     # Threads that spin while they wait take the cores from each other as soon as a loader's worker or any
     # other program runs; must be set before PyTorch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # not every encoding has ↑, – and µ
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage())

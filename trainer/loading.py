@@ -84,14 +84,14 @@ def resolve(
             or the store has no such model.
         FileNotFoundError: Nothing of that name exists; the message lists the forms.
     """
-    path, stored = Path(model), re.match(r"(models|runs):/", model)
-    if stored or path.exists():
-        _refuse(model, options)
-        loaded = _from_mlflow(model, device, tracking_uri) if stored else _from_path(path, device)
-        return _with_aux(loaded) if aux else loaded
-    if _looks_like_path(model):
-        raise FileNotFoundError(f"--model {model}: no such file; expected {FORMS}")
-    return _from_class_name(model, device, options, aux)
+    check_named(model, options)
+    if _is_stored(model):
+        loaded = _from_mlflow(model, device, tracking_uri)
+    elif Path(model).exists():
+        loaded = _from_path(Path(model), device)
+    else:
+        return _from_class_name(model, device, options, aux)
+    return _with_aux(loaded) if aux else loaded
 
 
 def check_named(model: str, options: Sequence[str] = ()) -> None:
@@ -102,7 +102,7 @@ def check_named(model: str, options: Sequence[str] = ()) -> None:
         ValueError: The class cannot be imported, or is something else.
         FileNotFoundError: Nothing of that name exists; the message lists the forms.
     """
-    if re.match(r"(models|runs):/", model) or Path(model).exists():
+    if _is_stored(model) or Path(model).exists():
         _refuse(model, options)
     elif _looks_like_path(model):
         raise FileNotFoundError(f"--model {model}: no such file; expected {FORMS}")
@@ -128,6 +128,10 @@ def _with_aux(loaded: Loaded) -> Loaded:
         )
     loaded.model.aux = True  # type: ignore[union-attr]  # checked above
     return loaded
+
+
+def _is_stored(model: str) -> bool:
+    return re.match(r"(models|runs):/", model) is not None
 
 
 def _looks_like_path(model: str) -> bool:

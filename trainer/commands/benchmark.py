@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import re
 import sys
 from pathlib import Path
@@ -236,8 +235,6 @@ def _print(about: dict[str, Any], session: Session) -> None:
 
     if not session.outcomes:
         return
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # not every encoding has – and µ
     console = Console(width=WIDTH if not sys.stdout.isatty() else min(Console().width, WIDTH))
     console.print(table(session.outcomes))
     lines = remarks(session.outcomes)

@@ -49,7 +49,7 @@ def costs_of(
         label = outcome.method.label
         if label == INPUT or outcome.status == "skipped":
             continue
-        key = json.dumps([label, outcome.facts, size, spp, setting.device, setting.memory])  # with releases
+        key = json.dumps([label, outcome.facts, size, spp, setting.device, setting.memory])
         if key not in known:
             say(f"measuring time and memory of {label} at {size[0]}x{size[1]}")
             try:

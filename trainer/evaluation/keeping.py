@@ -1,8 +1,7 @@
 """The folder of an evaluation: whose frames it is for, and the rows that need not be made again.
 
-data.json      which frames, and an identifier of the evaluation
-rows.jsonl     a row for each frame and method, as they come
-images/        what methods made
+In it `data.json` says which frames, and has an identifier of the evaluation; `rows.jsonl` has a row for each
+frame and method, as they come; `images` holds what methods made.
 """
 
 from __future__ import annotations
@@ -103,14 +102,14 @@ class Kept:
         self._lock = threading.Lock()
         self._rows: list[Row] = []
         lines = self.path.read_bytes().splitlines(keepends=True) if self.path.is_file() else []
-        whole = [line for line in lines if line.endswith(b"\n") and (row := _row(line)) and self._take(row)]
+        whole = []
+        for line in lines:
+            if (row := _row(line)) is not None:
+                self._rows.append(row)
+                whole.append(line)
         if whole != lines:
             with replacing(self.path) as partial:
                 partial.write_bytes(b"".join(whole))
-
-    def _take(self, row: Row) -> bool:
-        self._rows.append(row)
-        return True
 
     def of(self, method: Method, identity: str) -> dict[str, Row]:
         """Return the rows of a method that need not be made again.
@@ -151,9 +150,9 @@ class Kept:
 
 
 def _row(line: bytes) -> Row | None:
-    """Return the row of a line, None where that is damaged."""
+    """Return the row of a line, None where that is damaged or has no end."""
     try:
-        row = json.loads(line)
+        row = json.loads(line) if line.endswith(b"\n") else None
     except ValueError:
         return None
     return row if isinstance(row, dict) and {"method", "identity", "name", "status"} <= row.keys() else None

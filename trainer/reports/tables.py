@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -72,9 +70,7 @@ def print_scores(logged: Mapping[str, Any], prefix: str) -> None:
 
 
 def print_overviews(tables: Sequence[cells.Table]) -> None:
-    """Print tables of an evaluation; a pipe that is closed or lacks letters stops nothing."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
+    """Print tables of an evaluation; a pipe that is closed stops nothing."""
     console = Console()
     narrow = console.is_terminal
     if not narrow:  # whoever reads the lines wants to find names in them

@@ -98,7 +98,7 @@ function captionOf(column) {
   return columns[column].kind === "reference" ? "reference" : value === undefined || first < 0 ? "" : `${metrics[first].name} ${value === null ? "–" : printed(value, metrics[first].digits)}`;
 }
 
-// As Python's formats "4f" and "4g" do.
+// As Python's formats "4f" and "4g" do, but without exponents.
 function printed(value, digits) {
   if (typeof value === "string") return value;
   const count = parseInt(digits), text = digits.endsWith("g") ? String(Number(value.toPrecision(count))) : value.toFixed(count);
