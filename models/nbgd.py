@@ -45,10 +45,8 @@ from models.ops.grid_cells import LEVELS, Cells
 from models.ops.guides import depth_range, finite
 from models.ops.outliers import replace_outliers
 from models.ops.precision import wide
+from models.ops.ten_channels import FEATURES, ten_channels
 from models.ops.tonemap import LARGEST, exposed, filmic, gamma
-
-FEATURES = 10
-"""Channels of the network's input: tone-mapped colour 3, albedo 3, normal 3, depth 1."""
 
 GRIDS = (Cells(4, 4), Cells(8, 8), Cells(16, 16))
 """Cells of the three grids."""
@@ -170,17 +168,13 @@ class NBGD(Denoiser):
         return gamma(radiance) if self.curve == "gamma" else filmic(radiance)
 
     def _clean(self, buffers: Buffers) -> dict[str, Tensor]:
-        """Return finite buffers of legal range, depth in [0, 1], padded to the coarsest grid."""
+        """Return finite buffers of legal range, padded to the coarsest grid, and the numbers of the frame."""
         given = buffers.get("depth_range")
-        bounds = depth_range(buffers["depth"]) if given is None else given
-        depth = finite(buffers["depth"]).clamp_min(0.0)
-        near, far = (wide(bounds)[:, n, None, None, None].to(depth.dtype) for n in (0, 1))
-        span = far - near
         clean = {
             "irradiance": torch.nan_to_num(wide(buffers["irradiance"]), 0.0).clamp(0.0, LARGEST),
             "albedo": finite(buffers["albedo"], 1.0).clamp_min(0.0),
             "normal": finite(buffers["normal"]).clamp(-1.0, 1.0),
-            "depth": torch.where(span > 0, (depth - near) / torch.where(span > 0, span, 1.0), 0.0),
+            "depth": finite(buffers["depth"]).clamp_min(0.0),
         }
         clean = {name: self._padded(image) for name, image in clean.items()}
         exposure = wide(self.exposure(buffers))
@@ -188,7 +182,8 @@ class NBGD(Denoiser):
             clean["irradiance"] = replace_outliers(
                 clean["irradiance"], clean["albedo"], clean["normal"], exposure
             )
-        return {**clean, "exposure": exposure}
+        bounds = depth_range(buffers["depth"]) if given is None else wide(given)
+        return {**clean, "exposure": exposure, "depth_range": bounds}
 
     def _padded(self, images: Tensor) -> Tensor:
         height, width = images.shape[-2:]
@@ -198,9 +193,7 @@ class NBGD(Denoiser):
         return images
 
     def _features(self, clean: Mapping[str, Tensor]) -> Tensor:
-        """Return what the network sees, (B, 10, H, W)."""
-        color = self._toned(exposed(clean["irradiance"] * clean["albedo"], clean["exposure"]))
-        return torch.cat([color, clean["albedo"], clean["normal"] * 0.5 + 0.5, clean["depth"]], 1)
+        return ten_channels(clean, clean["exposure"], self._toned)
 
     def _guides(self, maps: Tensor) -> Guides:
         if not torch.compiler.is_exporting():

@@ -70,9 +70,8 @@ class AverageUNet(nn.Module):
         for level in range(len(self.encoder)):
             reach = max(reach, needed + 1) if level < len(self.heads) else reach
             joined.append(reach)
-            reach = (
-                reach // 2 + 1
-            )  # the last row of a doubled image also depends on the next one of its source
+            # The last row of a doubled image also depends on the next one of its source.
+            reach = reach // 2 + 1
         for level in range(len(self.encoder) - 1, -1, -1):
             reach = max(2 * reach, joined[level]) + 1
         return reach
