@@ -61,26 +61,28 @@ class LoadedScene:
 def load(spec: SceneSpec) -> LoadedScene:
     """Load a scene, without its cameras.
 
+    Mitsuba's optimisation merges meshes of one material: these can no longer be moved apart, and they come
+    in the order of addresses in memory, so that the same seed chooses other lights in every process.
+
     Raises:
         ValueError: Mitsuba cannot load it, the message names the scene or the file and says what Mitsuba
             said; or `moving` names something that is not a mesh of the scene.
     """
     if isinstance(spec.content, Path):
-        return _moving(spec, load_file(spec.content, optimize=not spec.moving))
+        return _moving(spec, load_file(spec.content))
     import mitsuba
 
     with tempfile.TemporaryDirectory(prefix="penumbra-") as folder:
         content = _Conversion(Path(folder)).of(spec.content)
         content = {k: v for k, v in content.items() if not _views(k, v)}
         try:
-            # Mitsuba merges meshes of one material, which can then no longer be moved apart.
-            scene = mitsuba.load_dict({"type": "scene", **content}, optimize=not spec.moving)
+            scene = mitsuba.load_dict({"type": "scene", **content}, optimize=False)
         except Exception as error:
             raise ValueError(f"scene {spec.name}: Mitsuba cannot load it: {_told(error)}") from error
     return _moving(spec, scene)
 
 
-def load_file(path: Path, optimize: bool = True) -> Any:
+def load_file(path: Path) -> Any:
     """Return the `mitsuba.Scene` of an XML file.
 
     Raises:
@@ -91,7 +93,7 @@ def load_file(path: Path, optimize: bool = True) -> Any:
     if not path.is_file():
         raise ValueError(f"scene {path} does not exist; name a Mitsuba XML file")
     try:
-        return mitsuba.load_file(str(path), optimize=optimize)
+        return mitsuba.load_file(str(path), optimize=False)
     except Exception as error:
         text = _told(error)
         hint = ""
