@@ -100,6 +100,16 @@ def test_the_bound_grows_until_the_pictures_fit(tmp_path):
     assert [p.scale.bound for p in tight.pictures[:3]] == [tight.quality.bound * n for n in (2, 1, 1)]
 
 
+def test_frames_that_nothing_could_denoise_have_no_pictures(tmp_path):
+    folder = make_folder(tmp_path, frames=1, methods=1, spps=(4,))
+    frames = json.loads((folder / "evaluation.json").read_text())["frames"]
+    frames[0] |= {"width": None, "height": None}
+
+    assert gallery_of(folder / "images", frames, columns(1)).frames == (1,)
+    lost = [frame | {"width": None, "height": None} for frame in frames]
+    assert gallery_of(folder / "images", lost, columns(1)).frames == ()
+
+
 def test_where_the_coarsest_bound_is_not_enough_frames_of_all_scenes_keep_pictures(tmp_path):
     folder = make_folder(tmp_path, frames=5, methods=1, spps=(4,))
     frames = json.loads((folder / "evaluation.json").read_text())["frames"]

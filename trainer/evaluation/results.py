@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -14,6 +16,7 @@ from trainer.evaluation.plan import Setting
 from trainer.evaluation.plots import write_plots
 from trainer.evaluation.record import write_record, write_rows, write_tables
 from trainer.evaluation.running import Outcome
+from trainer.evaluation.scoring import PROCESSES
 from trainer.evaluation.sheets import write_sheets
 from trainer.evaluation.tables import Scored
 from trainer.evaluation.tracking import EXPERIMENT, Tracked, keep_files, track, training_url
@@ -53,12 +56,21 @@ def write_results(
     measured = costs_of(outcomes, rows, setting, say) if costs else {}
     table = cost_table(measured, outcomes)
     tables = write_tables(rows, labels, setting, [table] if table else [])
-    write_plots(folder, rows, Scored(rows, labels, setting.metrics), measured)
-    write_sheets(folder, rows, outcomes)
-    tracked = _tracked(outcomes, rows, setting, say) if record else None
-    write_record(outcomes, rows, setting, measured, _pages(outcomes, tracked))
-    write_page(folder)
+    with _drawn(folder, rows, Scored(rows, labels, setting.metrics), measured):
+        write_sheets(folder, rows, outcomes)
+        tracked = _tracked(outcomes, rows, setting, say) if record else None
+        write_record(outcomes, rows, setting, measured, _pages(outcomes, tracked))
+        write_page(folder)
     return tables, tracked
+
+
+@contextmanager
+def _drawn(*plots: Any) -> Iterator[None]:
+    """Draw plots in another process meanwhile; raises as `write_plots`."""
+    with ProcessPoolExecutor(1, PROCESSES) as pool:
+        drawing = pool.submit(write_plots, *plots)
+        yield
+        drawing.result()
 
 
 def record_files(tracked: Tracked, folder: Path, say: Say) -> None:

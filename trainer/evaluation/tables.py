@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from trainer.evaluation.cells import Cell, Table
 from trainer.evaluation.plan import INPUT
@@ -28,7 +28,7 @@ Places = NDArray[np.intp]
 @cache
 def _reach(freedom: float) -> float:
     """Return how many standard errors the confidence interval reaches to either side (Student's t)."""
-    return float(stats.t.ppf(0.5 + CONFIDENCE / 2, freedom))
+    return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
 
 
 def cell_of(values: NDArray[np.float64], expected: int, form: str) -> Cell:

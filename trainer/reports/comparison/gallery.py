@@ -151,7 +151,8 @@ def gallery_of(
         ValueError: A file is damaged.
     """
     pictures = {i: _pictures(images, i, frame, columns) for i, frame in enumerate(frames)}
-    order = [i for i in _spread(frames) if pictures[i]]
+    # No row knows the size of a frame that only an earlier evaluation of the folder could denoise.
+    order = [i for i in _spread(frames) if pictures[i] and frames[i]["width"]]
     if not order:
         return Gallery((), QUALITIES[0], ())
     everything = [picture for i in order for picture in pictures[i]]
