@@ -17,6 +17,7 @@ from models.kp import KP
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
 from models.nbgd import NBGD
+from models.rae import RAE
 from models.sbmc import SBMC
 from models.wskp import WSKP
 from models.wskp_mr import MultiResolutionWSKP
@@ -29,6 +30,7 @@ __all__ = [
     "NBGD",
     "NFOR",
     "NLM",
+    "RAE",
     "SBMC",
     "WSKP",
     "CrossBilateral",

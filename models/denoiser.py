@@ -16,6 +16,10 @@ from models.ops.per_sample import arranged, check_samples
 
 Buffers = Mapping[str, Tensor]
 
+State = dict[str, Tensor]
+"""What a recurrent method carries from frame to frame: tensors (B, C, h, w) of any names. The sides of an
+image, padded to the method's grid, are multiples of h and w."""
+
 
 class Denoised(NamedTuple):
     """What a denoiser returns.
@@ -28,7 +32,7 @@ class Denoised(NamedTuple):
     """
 
     color: Tensor
-    state: Any = None
+    state: State | None = None
     aux: Mapping[str, Tensor] | None = None
 
 
@@ -68,6 +72,9 @@ class Denoiser(nn.Module):
         frames: Frames before and after a frame that one step of a space-time method looks at; 0: images.
             Otherwise buffers are sequences (B, T, C, H, W), and `forward` returns the middle frame.
         frame_halo: Frames on each side that the exact result of a frame depends on.
+        recurrent: `forward(buffers, state)` continues a sequence of images with the `Denoised.state` of the
+            frame before; None, the default, starts one.
+        whole: It looks anywhere in the frames before, so images are not cut into tiles.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
         exported_bytes_per_pixel: `bytes_per_pixel` of exported files, where it is more than half as much
@@ -89,6 +96,8 @@ class Denoiser(nn.Module):
     fill: Mapping[str, float] = {}
     frames: int = 0
     frame_halo: int = 0
+    recurrent: bool = False
+    whole: bool = False
     bytes_per_pixel: int = 500
     bytes_once: int = 0
     exported_bytes_per_pixel: int = 0
@@ -161,6 +170,19 @@ class Denoiser(nn.Module):
         exposure = self.exposure(batch).float()
         output = self(select(self, batch)).color.float()
         return {"color": Pair(output * exposure, batch["reference"].float() * exposure)}
+
+    def next_pair(self, batch: Mapping[str, Any], state: State | None) -> tuple[Pair, Denoised]:
+        """Denoise the next frame for training: what a recurrent method's paper compares, and the result.
+
+        Here exposed radiance is compared, float32.
+
+        Args:
+            batch: One frame of each sequence: inputs, `targets` and frame numbers.
+            state: Of the frame before; None: it is the first.
+        """
+        exposure = self.exposure(batch).float()
+        result = self(select(self, batch), state)
+        return Pair(result.color.float() * exposure, batch["reference"].float() * exposure), result
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return the parameters in the groups that a paper trains differently; `all` where it does not."""

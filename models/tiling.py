@@ -16,7 +16,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from data.buffers import FRAME_NUMBERS, SAMPLES
-from models.denoiser import Denoised
+from models.carried import Carried, continued
+from models.denoiser import Denoised, State
 from models.pace import Pace, listening
 
 BYTES_PER_PIXEL = 500
@@ -169,11 +170,12 @@ def denoise_in_tiles(
     progress: Callable[[float], None] | None = None,
     pace: Pace | None = None,
     run: Run | None = None,
+    state: State | None = None,
 ) -> Denoised:
     """Denoise images of any size within a memory budget; equal to one untiled call to 1e-5.
 
     Args:
-        denoiser: A `models.Denoiser`, or an object with the attributes of `Tileable`. Not recurrent.
+        denoiser: A `models.Denoiser`, or an object with the attributes of `Tileable`.
         buffers: Tensors (B, C, H, W) for each of its inputs, sequences (B, T, C, H, W) for space-time
             methods, `samples` (B, S, C, H, W), optionally frame numbers (`exposure` …); those that `measure`
             gives and the mapping lacks are measured on these images.
@@ -182,9 +184,11 @@ def denoise_in_tiles(
         progress: Called after each tile with the share of the work that is done.
         pace: Of the method, to call `progress` within tiles too.
         run: Calls the method on the buffers of a tile; None: here and now.
+        state: Of the frame before, for recurrent methods; None starts a sequence.
 
     Returns:
-        Linear radiance (B, 3, H, W) or all frames (B, T, 3, H, W), and `aux` where the method returns it.
+        Linear radiance (B, 3, H, W) or all frames (B, T, 3, H, W), and `aux` and `state` where the method
+        returns them.
 
     Raises:
         ValueError: A buffer is missing, sizes differ, or the budget is too small.
@@ -197,8 +201,9 @@ def denoise_in_tiles(
     if getattr(denoiser, "frames", 0):
         call = denoiser.clip  # type: ignore[attr-defined]  # declared by methods with `frames`
     held = buffers[SAMPLES].shape[1:3].numel() if SAMPLES in denoiser.inputs else 0
-    core = core_size(denoiser, (tall, wide), budget, batch, held)
-    if tile is not None:
+    cut = not getattr(denoiser, "whole", False)
+    core = core_size(denoiser, (tall, wide), budget, batch, held) if cut else (tall, wide)
+    if tile is not None and cut:
         rows, columns = (_even(side, max(tile, 1), multiple) for side in (tall, wide))
         core = (min(core[0], rows), min(core[1], columns))
     whole = _Whole((tall, wide))
@@ -211,7 +216,8 @@ def denoise_in_tiles(
         }
         with _steps(progress, pace, whole.done, _share(piece, (tall, wide))):
             given = {**part, **numbers}
-            result = call(given) if run is None else run(call, given)
+            step = call if state is None else continued(call, state, piece.read, whole.size)
+            result = step(given) if run is None else run(step, given)
         whole.place(piece, result)
         if progress is not None:
             progress(whole.done)
@@ -249,6 +255,7 @@ class _Whole:
         self.size, self.done = size, 0.0
         self.layers: dict[str | None, Tensor] = {}
         self.has_aux = False
+        self.carried = Carried(size)
 
     def place(self, piece: Tile, result: Any) -> None:
         """Copy the core of a tile's result."""
@@ -261,12 +268,14 @@ class _Whole:
             if name not in self.layers:
                 self.layers[name] = image.new_empty(*image.shape[:-2], *self.size)
             self.layers[name][..., piece.core[0], piece.core[1]] = image[..., inner_rows, inner_columns]
+        self.carried.place(piece.core, piece.read, getattr(result, "state", None))
         self.done += _share(piece, self.size)
 
     def cut(self, height: int, width: int) -> Denoised:
         """Return the result without the rows and columns that were padded."""
         aux = {n: image[..., :height, :width] for n, image in self.layers.items() if n is not None}
-        return Denoised(self.layers[None][..., :height, :width], aux=aux if self.has_aux else None)
+        color = self.layers[None][..., :height, :width]
+        return Denoised(color, self.carried.state, aux if self.has_aux else None)
 
 
 def numbers_of_frame(denoiser: Tileable, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from data.derive import automatic_exposure, derive
 from data.dropped import Dropped
 from data.frame import Frame, Image
 from data.temporal import Accumulator
-from models.denoiser import Denoiser
+from models.denoiser import Denoiser, State
 from models.pace import Pace
 from models.tiling import Run, denoise_in_tiles
 from trainer.attention import Attention, attention_of, attentive, inside
@@ -140,6 +140,8 @@ class ClipDenoiser:
         self._paces: dict[tuple[int, ...], Pace] = {}
         self._last: Frame | None = None
         self._exposure = 1.0
+        self._state: State | None = None
+        self._size: tuple[int, ...] = ()
 
     def push(self, item: Item, frame: Frame) -> Iterable[tuple[Item, Result]]:
         """Take the next frame and return what is finished with it.
@@ -169,6 +171,7 @@ class ClipDenoiser:
             self.progress(share - done)
             done = share
 
+        carried, self._state = self._carried(prepared, buffers), None
         with torch.inference_mode():
             denoised = denoise_in_tiles(
                 prepared.model,
@@ -178,9 +181,23 @@ class ClipDenoiser:
                 progress=advance,
                 pace=self.pace(prepared.model, buffers),
                 run=self.settings.run,
+                state=carried,
             )
+        self._state = denoised.state
         aux = {name: image[0] for name, image in (denoised.aux or {}).items()}
         return self.result(prepared, denoised.color[0], aux, self._attention(buffers))
+
+    def _carried(self, prepared: Prepared, buffers: Mapping[str, Tensor]) -> State | None:
+        """Return the state of the frame before; None where this one does not follow it."""
+        if getattr(prepared.model, "recurrent", False):
+            name, clip = self.loaded.source.reference, self.clip
+            if not clip.sequence:
+                self.say(f"the frames are independent views: {name} denoises each as the first of a sequence")
+            elif len(clip.items) == 1:
+                self.say(f"a single frame: {name} denoises it as the first of a sequence")
+        sizes = tuple(buffers[prepared.model.inputs[0]].shape)
+        follows, self._size = prepared.follows and sizes == self._size, sizes
+        return self._state if follows else None
 
     def pace(self, model: Model, buffers: Mapping[str, Tensor]) -> Pace | None:
         """Return when the steps of a method come, None for images so small that it does not matter.

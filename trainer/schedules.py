@@ -60,6 +60,38 @@ class OneCycle(LambdaLR):
         return low + (1 - low) * 0.5 * (1 - math.cos(math.pi * share))
 
 
+class InverseRoot(LambdaLR):
+    """The learning rate rises geometrically and falls with the root of the epoch, as Chaitanya et al. 2017.
+
+    Within `warmup` epochs it rises from `start` of the optimiser's own to all of it; epoch t after that has
+    `sqrt(warmup / t)` of it, or `1 / sqrt(t)` where there is no rise.
+
+    Args:
+        optimizer: Whose learning rate is scheduled.
+        warmup: Epochs of the rise.
+        start: First rate as a fraction of the peak.
+
+    Raises:
+        ValueError: `warmup` is negative or `start` not within (0, 1].
+    """
+
+    def __init__(self, optimizer: Optimizer, warmup: int = 10, start: float = 0.1) -> None:
+        if warmup < 0 or not 0 < start <= 1:
+            raise ValueError(f"InverseRoot: warmup {warmup}, start {start} are out of range")
+        self.warmup, self.start = warmup, start
+        super().__init__(optimizer, self.factor)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the position; the shape follows from the configuration, also of a resumed run."""
+        return {key: value for key, value in super().state_dict().items() if key not in ("warmup", "start")}
+
+    def factor(self, epoch: int) -> float:
+        """Return the learning rate of an epoch, from 0, as a fraction of the peak."""
+        if epoch < self.warmup:
+            return float(self.start ** (1 - epoch / self.warmup))
+        return math.sqrt(max(self.warmup, 1) / max(epoch, 1))
+
+
 class Halving(LambdaLR):
     """The learning rate falls to a fraction at each milestone and is constant between.
 

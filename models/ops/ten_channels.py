@@ -29,13 +29,22 @@ def ten_channels(
         curve: Tone curve, of exposed radiance to [0, 1].
     """
     exposed = exposure * buffers["irradiance"] * buffers["albedo"]
-    normal, depth = buffers["normal"] * 0.5 + 0.5, buffers["depth"]
-    given = buffers.get("depth_range")
-    bounds = depth_bounds(depth) if given is None else given.to(depth.dtype)
+    normal = buffers["normal"] * 0.5 + 0.5
+    depth = scaled_depth(buffers["depth"], buffers.get("depth_range"))
+    return torch.cat([curve(exposed), buffers["albedo"], normal, depth], 1)
+
+
+def scaled_depth(depth: Tensor, bounds: Tensor | None) -> Tensor:
+    """Return depth (B, 1, H, W) between 0, the nearest, and 1, the farthest; 0 where all are as far.
+
+    Args:
+        depth: In scene units.
+        bounds: (B, 2), smallest and largest depth of the whole frame; None: those of this image.
+    """
+    bounds = depth_bounds(depth) if bounds is None else bounds.to(depth.dtype)
     near, far = bounds[:, 0, None, None, None], bounds[:, 1, None, None, None]
     span = far - near
-    scaled = torch.where(span > 0, (depth - near) / torch.where(span > 0, span, 1.0), 0.0)
-    return torch.cat([curve(exposed), buffers["albedo"], normal, scaled], 1)
+    return torch.where(span > 0, (depth - near) / torch.where(span > 0, span, 1.0), 0.0)
 
 
 def depth_bounds(depth: Tensor) -> Tensor:

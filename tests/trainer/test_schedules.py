@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from trainer.schedules import Halving, OneCycle
+from trainer.schedules import Halving, InverseRoot, OneCycle
 
 
 def rates(steps, **options):
@@ -106,3 +106,30 @@ def test_restored_halving_continues_and_takes_new_milestones():
 def test_impossible_halvings_are_refused(options):
     with pytest.raises(ValueError, match=r"milestones must be ascending|expected epoch or step"):
         halving(1, **options)
+
+
+def rates(epochs, **options):
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.001)
+    schedule = InverseRoot(optimizer, **options)
+    found = []
+    for _ in range(epochs):
+        found.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return found
+
+
+def test_inverse_root_rises_geometrically_and_falls_with_the_root_of_the_epoch():
+    found = rates(41)
+    assert found[0] == pytest.approx(1e-4)
+    assert found[5] == pytest.approx(1e-3 / 10**0.5)
+    assert found[10] == pytest.approx(1e-3)
+    assert found[40] == pytest.approx(0.5e-3)
+    assert rates(5, warmup=0) == pytest.approx([1e-3, 1e-3, 1e-3 / 2**0.5, 1e-3 / 3**0.5, 0.5e-3])
+
+
+def test_impossible_inverse_roots_are_refused():
+    with pytest.raises(ValueError, match="out of range"):
+        rates(1, start=0)
+    with pytest.raises(ValueError, match="out of range"):
+        rates(1, warmup=-1)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from models.denoiser import Denoiser
-from trainer.modules.evaluation import noisy_input
+from trainer.modules.evaluation import Evaluated, noisy_input
 from trainer.reports.pictures import comparison
 from trainer.tracking import MLflowTracking
 
@@ -87,11 +86,13 @@ class ValidationPictures(Callback):
         one = {k: v[row : row + 1] for k, v in batch.items() if isinstance(v, torch.Tensor)}
         if "sample_channels" in batch:
             one["sample_channels"] = batch["sample_channels"]
-        net = cast(Denoiser, module.net)
+        assert isinstance(module, Evaluated)
+        net = module.net
+        one, denoised = module.pictured(one)
         images = {
             "noisy": one.get("color"),
             "accumulated": noisy_input(net, one) if net.temporal else None,
-            "denoised": module(one).color,
+            "denoised": denoised.color,
             "reference": one["reference"],
         }
         arrays = {

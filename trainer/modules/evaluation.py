@@ -84,6 +84,10 @@ class Evaluated(LightningModule):
         assert isinstance(result, Denoised)
         return result
 
+    def pictured(self, batch: Batch) -> tuple[Batch, Denoised]:
+        """Return the images of a validation batch that pictures are made of, and their results."""
+        return batch, self(batch)
+
     def exposed(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Return exposed output and exposed reference, float32 (B, 3, H, W)."""
         exposure = batch["exposure"].float().reshape(-1, 1, 1, 1)
