@@ -99,6 +99,8 @@ class Recurrent(nn.Module):
         ValueError: A weight is negative, `size` even, or `sigma` not positive.
     """
 
+    kernel: Tensor
+
     def __init__(
         self,
         spatial: float = 0.8,

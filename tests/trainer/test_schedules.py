@@ -108,7 +108,7 @@ def test_impossible_halvings_are_refused(options):
         halving(1, **options)
 
 
-def rates(epochs, **options):
+def root_rates(epochs, **options):
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.001)
     schedule = InverseRoot(optimizer, **options)
     found = []
@@ -120,16 +120,16 @@ def rates(epochs, **options):
 
 
 def test_inverse_root_rises_geometrically_and_falls_with_the_root_of_the_epoch():
-    found = rates(41)
+    found = root_rates(41)
     assert found[0] == pytest.approx(1e-4)
     assert found[5] == pytest.approx(1e-3 / 10**0.5)
     assert found[10] == pytest.approx(1e-3)
     assert found[40] == pytest.approx(0.5e-3)
-    assert rates(5, warmup=0) == pytest.approx([1e-3, 1e-3, 1e-3 / 2**0.5, 1e-3 / 3**0.5, 0.5e-3])
+    assert root_rates(5, warmup=0) == pytest.approx([1e-3, 1e-3, 1e-3 / 2**0.5, 1e-3 / 3**0.5, 0.5e-3])
 
 
 def test_impossible_inverse_roots_are_refused():
     with pytest.raises(ValueError, match="out of range"):
-        rates(1, start=0)
+        root_rates(1, start=0)
     with pytest.raises(ValueError, match="out of range"):
-        rates(1, warmup=-1)
+        root_rates(1, warmup=-1)

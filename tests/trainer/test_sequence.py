@@ -59,7 +59,9 @@ class Sequences(Synthetic):
         class Continued(DataLoader[dict[str, Tensor]]):
             def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
                 assert isinstance(data.trainer, lightning.Trainer)
-                yield from list(super().__iter__())[data.trainer.fit_loop.epoch_loop.batch_progress.current.ready :]
+                yield from list(super().__iter__())[
+                    data.trainer.fit_loop.epoch_loop.batch_progress.current.ready :
+                ]
 
             def state_dict(self) -> dict[str, Any]:
                 return {}
@@ -162,10 +164,10 @@ def run(folder: Path, kill_at: int | None = None, resume: bool = False) -> dict[
     made = trainer(folder, callbacks=[saving], enable_checkpointing=True, limit_val_batches=0)
     ordinary = trained.training_step
 
-    def killed(given: dict[str, Any], number: int) -> Tensor:
+    def killed(batch: dict[str, Any], batch_idx: int) -> Tensor:
         if trained.global_step == kill_at:
             raise KilledError
-        return ordinary(given, number)
+        return ordinary(batch, batch_idx)
 
     trained.training_step = killed  # type: ignore[method-assign]
     path = folder / "last.ckpt"
