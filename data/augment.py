@@ -1,4 +1,4 @@
-"""Flips, rotations and exposure changes of training patches.
+"""Flips, rotations and exposure changes of training patches, and the order of the frames of a clip.
 
 Randomness has no state: what happens to a sample is a function of (seed, epoch, sample), so that it depends
 neither on the number of workers nor on where a run was interrupted.
@@ -99,6 +99,10 @@ class Augmentation:
             as at the start of a sequence and where a surface comes into view.
         samples: Fewest and most samples per pixel of a batch, where they are kept apart; drawn anew for each
             batch, and which ones for each patch. None: all of them.
+        reverse: Probability with which a clip runs backward. Motion vectors would be wrong then.
+        freeze: Probability with which a clip repeats one of its frames, noise included, from there to its
+            end, as if the camera stopped; all but the last are equally likely. Both as Chaitanya et al. 2017
+            train.
     """
 
     rule: Rule = "wskp"
@@ -107,14 +111,17 @@ class Augmentation:
     permute: bool = False
     drop_history: float = 0.0
     samples: tuple[int, int] | None = None
+    reverse: float = 0.0
+    freeze: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rule not in ("wskp", "dihedral", "none"):
             raise ValueError(f"augmentation rule {self.rule!r}; expected wskp, dihedral or none")
         if not 0 <= self.exposure_stops <= 16:
             raise ValueError(f"exposure_stops is {self.exposure_stops}; expected 0 to 16")
-        if not 0 <= self.drop_history <= 1:
-            raise ValueError(f"drop_history is {self.drop_history}; expected a probability, 0 to 1")
+        for name in ("drop_history", "reverse", "freeze"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a probability, 0 to 1")
         if self.samples is not None and not 1 <= self.samples[0] <= self.samples[-1]:
             raise ValueError(
                 f"sample_counts is {list(self.samples)}; expected two numbers, 1 <= fewest <= most"
@@ -145,6 +152,22 @@ class Augmentation:
             return held
         fewest, most = (min(number, held) for number in self.samples)
         return fewest + (random_bits(self.seed, epoch, sample, 6) >> 8) % (most - fewest + 1)
+
+    def frame_order(self, epoch: int, sample: int, frames: int) -> tuple[int, ...]:
+        """Return which frame of a clip comes at each place; a clip that is reversed may be frozen too.
+
+        Args:
+            epoch: Number of the epoch.
+            sample: Number of the clip.
+            frames: Frames of the clip, at least 2.
+        """
+        order = list(range(frames))
+        if random_bits(self.seed, epoch, sample, 7) < self.reverse * 2**64:
+            order.reverse()
+        if random_bits(self.seed, epoch, sample, 8) < self.freeze * 2**64:
+            last = (random_bits(self.seed, epoch, sample, 9) >> 8) % (frames - 1)
+            order[last:] = [order[last]] * (frames - last)
+        return tuple(order)
 
     def exposure_factor(self, epoch: int, sample: int) -> float:
         """Return the factor that is applied to the sample's exposure."""

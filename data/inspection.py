@@ -202,6 +202,7 @@ def _described(index: Index, problems: Mapping[str, str | None]) -> dict[str, An
             name: {
                 "shards": len(index.of(name)),
                 "samples": index.count(name),
+                "frames": 1 if name == "test" else index.frames,
                 "bytes": sum(s.bytes for s in index.of(name)),
                 "buffers": _sampled(index, name, {file for file, p in problems.items() if p}),
             }
@@ -254,7 +255,7 @@ def _sample_statistics(reader: ShardReader, number: int) -> dict[str, dict[str, 
             gone = 100 * float(np.isnan(array).all(1).mean())
             result[name] = {**entry, "non_finite_percent": gone}
         elif name in BUFFERS:
-            image = np.moveaxis(array, 0, -1).astype(np.float32)
+            image = np.moveaxis(array, -3, -1).astype(np.float32)
             good = np.isfinite(image).all(-1)
             result[name] = {
                 **entry,

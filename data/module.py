@@ -14,13 +14,14 @@ from data.manifest import load_manifest
 from data.needs import beside, explain_lacking, patch_number
 from data.progress import LineProgress
 from data.root import Root, resolve_root
-from data.shards.batch import Batches, available
+from data.shards.batch import Batches
 from data.shards.cache import ShardCache
 from data.shards.index import Index
 from data.shards.loader import EvaluationLoader, TrainingLoader
 from data.shards.options import recipe_options
 from data.shards.prepare import cached_path, prepare_cached
 from data.shards.read import CorruptSampleError, Sample, ShardReader
+from data.shards.shapes import available
 
 Loader = TrainingLoader | EvaluationLoader
 
@@ -30,6 +31,10 @@ class Shards(LightningDataModule):
 
     A batch is a dictionary: each buffer as float32 (B, C, H, W), raw linear values; `exposure` (B,) and
     `depth_range` (B, 2) of the whole frame; `scene` and `key`, lists of str; `frame` (B,) int64.
+
+    With `frames` N above 1, training and validation samples are clips, the same window of N consecutive
+    frames: buffers (B, N, C, H, W), `depth_range` (B, N, 2), `exposure` and `frame` of the clip's first
+    frame as it was rendered. Test samples are single frames as ever.
 
     Every rank sees the same number of training batches, and different samples; the order follows from seed
     and epoch, not from the number of workers, and a run continues with the next batch in the middle of an
@@ -51,7 +56,7 @@ class Shards(LightningDataModule):
         train_patches: Training patches per 1280x720 frame, where the root is prepared here; with the recipe
             `afgsa` the candidates, of which about two thirds are kept. None: as the recipe says, 80 as in
             WSKP without one; for a sample, whose frames are few and small, `data.sample.TRAIN_PATCHES`,
-            `data.sample.CANDIDATES` or `data.sample.CROPS`.
+            `data.sample.CANDIDATES`, `data.sample.CROPS` or `data.sample.CLIP_PATCHES`.
         validation_patches: Validation patches per 1280x720 frame, where the root is prepared here; None: as
             the recipe says, 20 without one.
         patch_size: Width and height of patches, where the root is prepared here.
@@ -64,13 +69,19 @@ class Shards(LightningDataModule):
         targets: Buffers that training compares with. The command line fills it in from the network.
         temporal: Deliver `irradiance` accumulated over preceding frames as stored, otherwise color / albedo
             of the frame alone. The command line fills it in from the network.
-        recipe: How the root is prepared here, `bmfr`, `afgsa` or `layers` (see `trainer prepare --help`);
-            None: as WSKP, with whatever samples the frames keep apart.
+        recipe: How the root is prepared here, `bmfr`, `afgsa`, `layers` or `recurrent` (see `trainer prepare
+            --help`); None: as WSKP, with whatever samples the frames keep apart.
         sample_counts: Fewest and most samples per pixel that a training batch keeps, drawn anew for each
             batch, where frames keep samples apart; None: all.
         spp: Use only frames with these samples per pixel, where the root is prepared here; None: all.
         cache_gb: Where the root is a URL, size of the copies of shards in `$PENUMBRA_CACHE`, for all runs of
             this machine together. Samples of shards that do not fit are read over the network each time.
+        frames: Consecutive frames of a training or validation sample; shards that are given must have as
+            many. None: as the recipe says, 1 without one.
+        reverse: Share of training clips that run backward.
+        freeze: Share of training clips that repeat one of their frames, from there to the end.
+        whole_scenes: In test, all frames of a scene go to one rank, in order, as networks with a memory need
+            them, instead of each to the next rank.
 
     Where shards hold the samples of each pixel, a batch has `samples` (B, S, C, H, W), `sample_channels`, a
     list of C names such as `radiance.R`, and `thin_lens` (B, 3), aperture radius, focus distance and field of
@@ -96,11 +107,15 @@ class Shards(LightningDataModule):
         verify: bool = True,
         buffers: Sequence[str] | None = None,
         temporal: bool = True,
-        recipe: Literal["bmfr", "afgsa", "layers"] | None = None,
+        recipe: Literal["bmfr", "afgsa", "layers", "recurrent"] | None = None,
         spp: Sequence[int] | None = None,
         targets: Sequence[str] = ("reference",),
         sample_counts: tuple[int, int] | None = None,
         cache_gb: float = 50.0,
+        frames: int | None = None,
+        reverse: float = 0.0,
+        freeze: float = 0.0,
+        whole_scenes: bool = False,
     ) -> None:
         super().__init__()
         if batch_size < 1 or workers < 0:
@@ -111,10 +126,9 @@ class Shards(LightningDataModule):
             raise ValueError(f"cache_gb is {cache_gb}; expected gigabytes, more than 0")
         self.root, self.cache_gb = root, cache_gb
         self.batch_size, self.workers, self.seed = batch_size, workers, seed
+        changes = (augment_rule, exposure_stops, seed, permute, drop_history, sample_counts, reverse, freeze)
         self.augmentation = (
-            Augmentation(augment_rule, exposure_stops, seed, permute, drop_history, sample_counts)
-            if augment
-            else Augmentation("none", seed=seed, samples=sample_counts)
+            Augmentation(*changes) if augment else Augmentation("none", seed=seed, samples=sample_counts)
         )
         self.targets = tuple(dict.fromkeys(("reference", *targets)))
         explicit = {
@@ -122,10 +136,17 @@ class Shards(LightningDataModule):
             "validation_patches": validation_patches,
             "seed": seed,
             "spp": None if spp is None else tuple(spp),
+            "frames": frames,
             "buffers": beside(recipe, (*(buffers or ()), *self.targets)) or None,
             **patch_number(root, recipe, train_patches),
         }
         self.options = recipe_options(recipe, explicit)
+        self.frames, self.whole_scenes = self.options.frames, whole_scenes
+        if self.frames == 1 and max(reverse, freeze) > 0:
+            raise ValueError(
+                "reverse and freeze change clips, and samples are single frames; name frames, or recipe "
+                "recurrent"
+            )
         self.on_corrupt, self.verify = on_corrupt, verify
         for name in (*(buffers or ()), *targets):
             if name != SAMPLES:
@@ -223,12 +244,12 @@ class Shards(LightningDataModule):
         return self._keep("train", loader)
 
     def val_dataloader(self) -> EvaluationLoader | list[Any]:
-        """Return the loader of this rank's validation patches; nothing where there are none."""
+        """Return the loader of this rank's validation patches or clips; nothing where there are none."""
         return self._evaluation("validation", self.batch_size)
 
     def test_dataloader(self) -> EvaluationLoader | list[Any]:
-        """Return the loader of this rank's whole test frames, one at a time in the order of scene and
-        frame."""
+        """Return the loader of this rank's whole test frames, one at a time in the order of scene and frame;
+        with `whole_scenes` those of whole scenes."""
         return self._evaluation("test", 1)
 
     def teardown(self, stage: str) -> None:
@@ -252,11 +273,18 @@ class Shards(LightningDataModule):
             world=world,
             workers=self.workers,
             pin_memory=self._on_gpu(),
+            whole_scenes=self.whole_scenes and split == "test",
         )
         return self._keep(split, loader)
 
     def _batches(self, split: str, augmentation: Augmentation | None) -> Batches:
         index = self.index
+        if split != "test" and index.frames != self.frames:
+            raise ValueError(
+                f"{index.place} holds {_samples_text(index.frames)}, and {_samples_text(self.frames)} are to "
+                f"be read: set --data.frames {index.frames}, or prepare again: trainer prepare FRAMES "
+                f"--output SHARDS --clip-frames {self.frames}"
+            )
         cache = None if index.url is None else ShardCache(index, round(self.cache_gb * 1e9))
         reader = ShardReader(index, split, self.verify, cache)
         names = self._names(reader, evaluation=augmentation is None)
@@ -310,3 +338,7 @@ class Shards(LightningDataModule):
         resumes."""
         assert self.trainer is not None
         return int(self.trainer.fit_loop.epoch_loop.batch_progress.current.ready)
+
+
+def _samples_text(frames: int) -> str:
+    return "single frames" if frames == 1 else f"clips of {frames} frames"

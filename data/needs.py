@@ -8,7 +8,7 @@ from pathlib import Path
 from data.buffers import SAMPLES
 from data.manifest import FrameRecord
 from data.root import SAMPLE
-from data.sample import CANDIDATES, CROPS, TRAIN_PATCHES
+from data.sample import CANDIDATES, CLIP_PATCHES, CROPS, TRAIN_PATCHES
 from data.shards.options import recipe_options
 
 
@@ -25,7 +25,7 @@ def patch_number(root: str, recipe: str | None, number: int | None) -> dict[str,
     if recipe_options(recipe, {}).sampling == "importance":
         return {"candidates": CANDIDATES if number is None and sample else number}
     if number is None and sample:
-        number = {None: TRAIN_PATCHES, "layers": CROPS}.get(recipe)
+        number = {None: TRAIN_PATCHES, "layers": CROPS, "recurrent": CLIP_PATCHES}.get(recipe)
     return {"train_patches": number}
 
 

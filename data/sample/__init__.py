@@ -15,6 +15,10 @@ TRAIN_PATCHES = 320
 """Training patches per 1280x720 frame that a sample is prepared with unless told otherwise: at the usual
 density its few small frames give 5 patches each, too few to learn from."""
 
+CLIP_PATCHES = 320
+"""Training patches per 1280x720 frame of clips that a sample is prepared with unless told otherwise: 25 clips
+of seven frames for each scene of nine frames of 320x180, 160 MB of two, and 12 batches of four."""
+
 CANDIDATES = 3600
 """Candidates of importance sampling per 1280x720 frame that a sample is prepared with unless told otherwise:
 a hundred per frame of 160x160, of which about two thirds are kept."""

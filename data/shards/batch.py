@@ -1,10 +1,13 @@
-"""Makes batches of samples: raw bytes of the mapped shards to float32 (B, C, H, W), turned on the way."""
+"""Makes batches of samples: raw bytes of the mapped shards to float32 (B, C, H, W), turned on the way.
+
+Of clips a batch has (B, N, C, H, W): all frames of a clip are turned alike, and may come in another order.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,10 +16,10 @@ from torch.utils.data import Dataset, get_worker_info
 
 from data import augment_samples
 from data.augment import IMAGE_PLANE, UNCHANGED, Augmentation, Change, Turn, reordered, turn_vectors, turned
-from data.buffers import SAMPLES, THIN_LENS, buffer
+from data.buffers import SAMPLES
+from data.shards.packed import Packed, allocate, nothing
 from data.shards.read import CorruptSampleError, Sample, ShardReader
-
-Batch = dict[str, Any]
+from data.shards.shapes import frames_of, kept_text, shape_of
 
 
 class Order(NamedTuple):
@@ -33,52 +36,6 @@ class Order(NamedTuple):
     ahead: tuple[int, ...] = ()
 
 
-class Packed(NamedTuple):
-    """A batch as it travels from a worker: all images in one piece of shared memory.
-
-    Attributes:
-        pixels: float32, one after another each buffer's (B, C, H, W), (B, S, C, H, W) of `samples`.
-        shapes: Name and shape of each.
-        numbers: Exposure, smallest and largest depth, aperture, focus and field of view of each.
-        samples: Scene, frame and key of each.
-        channels: Channels of `samples`, where it is among the buffers.
-        corrupt: Samples that were left out, with the reason.
-        error: Why there is no batch. Raised in a worker it would arrive as another type, with a traceback for
-            its message.
-        read: Bytes of the samples in their shards.
-        downloaded: Bytes that the process has downloaded since it made its last batch.
-    """
-
-    pixels: Tensor
-    shapes: tuple[tuple[str, tuple[int, ...]], ...]
-    numbers: tuple[tuple[float, ...], ...]
-    samples: tuple[tuple[str, int, str], ...]
-    corrupt: tuple[tuple[str, str], ...]
-    error: Exception | None = None
-    channels: tuple[str, ...] = ()
-    read: int = 0
-    downloaded: int = 0
-
-    def unpack(self) -> Batch:
-        """Return the batch: views of `pixels`, frame numbers, scenes, frames, keys."""
-        batch: Batch = {}
-        start = 0
-        for name, shape in self.shapes:
-            size = math.prod(shape)
-            batch[name] = self.pixels[start : start + size].view(shape)
-            start += size
-        numbers = torch.tensor(self.numbers, dtype=torch.float32)
-        batch["exposure"] = numbers[:, 0].contiguous()
-        batch["depth_range"] = numbers[:, 1:3].contiguous()
-        batch["scene"] = [scene for scene, _, _ in self.samples]
-        batch["frame"] = torch.tensor([frame for _, frame, _ in self.samples], dtype=torch.int64)
-        batch["key"] = [key for _, _, key in self.samples]
-        if self.channels:
-            batch["sample_channels"] = list(self.channels)
-            batch[THIN_LENS] = numbers[:, 3:].contiguous()
-        return batch
-
-
 class Batches(Dataset[Packed]):
     """Maps an `Order` to a batch.
 
@@ -91,6 +48,9 @@ class Batches(Dataset[Packed]):
         augmentation: What happens to training samples; None for evaluation.
         on_corrupt: `raise`, or `skip`: in training the next sample takes the place of a damaged one, in
             evaluation it is left out.
+
+    Raises:
+        ValueError: Clips are to run backward, and motion vectors are to be delivered.
     """
 
     def __init__(
@@ -106,6 +66,12 @@ class Batches(Dataset[Packed]):
         self.names = tuple(dict.fromkeys(names))
         self.inputs = frozenset(inputs)
         self.augmentation, self.on_corrupt = augmentation, on_corrupt
+        moving = ", ".join(name for name in self.names if name in IMAGE_PLANE)
+        if moving and augmentation is not None and augmentation.reverse > 0:
+            raise ValueError(
+                f"{moving} is wrong in a clip that runs backward; use --data.reverse 0, or a network that "
+                "does not read it"
+            )
 
     def __len__(self) -> int:
         return len(self.reader)
@@ -116,7 +82,7 @@ class Batches(Dataset[Packed]):
         except (ValueError, OSError) as error:
             if get_worker_info() is None:
                 raise
-            return _nothing(error=error)
+            return nothing(error=error)
 
     def read(self, order: Order) -> Packed:
         """Return the samples of an order; `[]` does the same, and in a worker packs errors.
@@ -130,11 +96,13 @@ class Batches(Dataset[Packed]):
         numbers, corrupt = self._readable(order.samples)
         samples = [self.reader.sample(number) for number in numbers]
         if not samples:
-            return _nothing(corrupt)
+            return nothing(corrupt)
         kept = self._sample_count(order.epoch, numbers, samples) if SAMPLES in self.names else 0
-        shapes = tuple((name, (len(samples), *_shape(samples, name, kept))) for name in self.names)
-        pixels = _allocate(sum(math.prod(shape) for _, shape in shapes))
+        frames = frames_of(samples)
+        shapes = tuple((name, (len(samples), *shape_of(samples, name, kept))) for name in self.names)
+        pixels = allocate(sum(math.prod(shape) for _, shape in shapes))
         changes = [self._change(order.epoch, number) for number in numbers]
+        clips = [self._frame_order(order.epoch, number, frames) for number in numbers]
         start = 0
         for name, shape in shapes:
             size = math.prod(shape)
@@ -143,17 +111,18 @@ class Batches(Dataset[Packed]):
                 if name == SAMPLES:
                     self._fill_samples(target[row], number, order.epoch, changes[row])
                 else:
-                    self._fill(target[row], number, name, changes[row])
+                    self._fill(target[row], number, name, changes[row], clips[row])
             start += size
         return Packed(
             pixels,
             shapes,
-            tuple(self._numbers(order.epoch, n, s) for n, s in zip(numbers, samples, strict=True)),
+            tuple(self._numbers(order.epoch, *each) for each in zip(numbers, samples, clips, strict=True)),
             tuple((sample.scene, sample.frame, sample.key) for sample in samples),
             corrupt,
             channels=samples[0].sample_channels if SAMPLES in self.names else (),
             read=sum(self.reader.bytes_of(number) for number in numbers),
             downloaded=0 if self.reader.cache is None else self.reader.cache.take_count(),
+            frames=frames,
         )
 
     def _readable(self, numbers: Iterable[int]) -> tuple[list[int], tuple[tuple[str, str], ...]]:
@@ -182,23 +151,29 @@ class Batches(Dataset[Packed]):
     def _change(self, epoch: int, number: int) -> Change:
         return UNCHANGED if self.augmentation is None else self.augmentation.change(epoch, number)
 
-    def _numbers(self, epoch: int, number: int, sample: Sample) -> tuple[float, ...]:
-        factor = 1.0 if self.augmentation is None else self.augmentation.exposure_factor(epoch, number)
-        return (sample.exposure * factor, *sample.depth_range, *sample.thin_lens)
+    def _frame_order(self, epoch: int, number: int, frames: int) -> tuple[int, ...]:
+        """Return which frame of a clip comes at each place; of a single frame nothing."""
+        if frames == 1:
+            return ()
+        if self.augmentation is None:
+            return tuple(range(frames))
+        return self.augmentation.frame_order(epoch, number, frames)
 
-    def _fill(self, target: Tensor, number: int, name: str, change: Change) -> None:
+    def _numbers(self, epoch: int, number: int, sample: Sample, clip: tuple[int, ...]) -> tuple[float, ...]:
+        factor = 1.0 if self.augmentation is None else self.augmentation.exposure_factor(epoch, number)
+        depths = [sample.depth_range[2 * frame + end] for frame in clip or (0,) for end in (0, 1)]
+        return (sample.exposure * factor, *depths, *sample.thin_lens)
+
+    def _fill(self, target: Tensor, number: int, name: str, change: Change, clip: tuple[int, ...]) -> None:
+        """Write a buffer of a sample as it is delivered; `clip`: as `_frame_order` returns it."""
         source = self._source(number, name, change.alone)
-        if change[:4] == UNCHANGED[:4]:
-            target.copy_(source)
-            return
-        # Converting first and turning then is several times faster than both in one strided pass.
-        plain = reordered(source.to(torch.float32).numpy(), name, change)
-        if change.turn == Turn.NONE:
-            np.copyto(target.numpy(), plain)
-            return
-        np.copyto(target.numpy(), turned(plain, change.turn))
-        if name in IMAGE_PLANE:
-            turn_vectors(target.numpy(), change.turn, name)
+        if not clip:
+            _write(target, source, name, change)
+        for place, frame in enumerate(clip):
+            if name in IMAGE_PLANE and frame in clip[:place]:
+                target[place] = 0  # nothing moves where a frame is repeated
+            else:
+                _write(target[place], source[frame], name, change)
 
     def _sample_count(self, epoch: int, numbers: list[int], samples: list[Sample]) -> int:
         """Return how many samples per pixel all patches of a batch get."""
@@ -209,7 +184,7 @@ class Batches(Dataset[Packed]):
             )
         chosen = self.augmentation is not None and self.augmentation.samples is not None
         if len({sample.sample_channels for sample in samples}) > 1 or (len(held) > 1 and not chosen):
-            kinds = {_kept(s): f"{s.scene}/frame {s.frame} has {_kept(s)}" for s in samples}
+            kinds = {kept_text(s): f"{s.scene}/frame {s.frame} has {kept_text(s)}" for s in samples}
             listed = ", ".join(kinds.values())
             raise ValueError(
                 f"one batch with different samples per pixel ({listed}); expected the same number and "
@@ -231,7 +206,8 @@ class Batches(Dataset[Packed]):
             augment_samples.changed(source.to(torch.float32).numpy(), channels, change, target.numpy())
 
     def _source(self, number: int, name: str, alone: bool = False) -> Tensor:
-        """Return a buffer (C, H, W) of a sample, stored or computed; `alone`: without history."""
+        """Return a buffer (C, H, W) of a sample, (N, C, H, W) of a clip, stored or computed; `alone`: without
+        history."""
         sample, reader = self.reader.sample(number), self.reader
         stored = sample.buffers
         if alone and sample.accumulated and {"color", "albedo"} <= stored.keys():
@@ -254,46 +230,16 @@ class Batches(Dataset[Packed]):
         return torch.where(albedo > 0, color / albedo.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
 
 
-def available(sample: Sample) -> tuple[str, ...]:
-    """Return the buffers that a sample holds or that follow from them."""
-    names = dict.fromkeys(sample.buffers)
-    if "irradiance" in names and "albedo" in names:
-        names["color"] = None
-    if "color" in names and "albedo" in names:
-        names["irradiance"] = None
-    return tuple(names)
-
-
-def _nothing(corrupt: tuple[tuple[str, str], ...] = (), error: Exception | None = None) -> Packed:
-    return Packed(torch.empty(0), (), (), (), corrupt, error)
-
-
-def _shape(samples: list[Sample], name: str, kept: int) -> tuple[int, ...]:
-    if name != SAMPLES:
-        return (buffer(name).channels, *_size(samples))
-    return (kept, len(samples[0].sample_channels), *_size(samples))
-
-
-def _kept(sample: Sample) -> str:
-    stored = sample.buffers.get(SAMPLES)
-    return "none" if stored is None else f"{stored.shape[0]} of {len(sample.sample_channels)} channels each"
-
-
-def _size(samples: list[Sample]) -> tuple[int, int]:
-    sizes = {(sample.height, sample.width) for sample in samples}
-    if len(sizes) > 1:
-        listed = ", ".join(f"{width}x{height}" for height, width in sorted(sizes))
-        raise ValueError(f"samples of different size in one batch: {listed}; whole frames need a batch of 1")
-    return sizes.pop()
-
-
-def _allocate(count: int) -> Tensor:
-    """Return uninitialised float32 memory, shared between processes when called in a worker.
-
-    A worker that fills ordinary memory makes the queue copy the batch into shared memory; torch's own
-    collation avoids that in the same way.
-    """
-    if get_worker_info() is None:
-        return torch.empty(count)
-    storage = torch.UntypedStorage._new_shared(4 * count)
-    return torch.empty(0).set_(storage, 0, (count,), (1,))
+def _write(target: Tensor, source: Tensor, name: str, change: Change) -> None:
+    """Write an image (C, H, W) after a change into a target of the same shape."""
+    if change[:4] == UNCHANGED[:4]:
+        target.copy_(source)
+        return
+    # Converting first and turning then is several times faster than both in one strided pass.
+    plain = reordered(source.to(torch.float32).numpy(), name, change)
+    if change.turn == Turn.NONE:
+        np.copyto(target.numpy(), plain)
+        return
+    np.copyto(target.numpy(), turned(plain, change.turn))
+    if name in IMAGE_PLANE:
+        turn_vectors(target.numpy(), change.turn, name)

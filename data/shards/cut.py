@@ -1,5 +1,7 @@
 """Writes the shards of one scene: reads its frames once, in order, and cuts every patch out of them.
 
+Of clips as many frames as one has are held at a time, and a clip is cut when its last frame has been read.
+
 What is cut follows from the manifest, the options and the pixels of the frame, so scenes can be done by
 several processes, and again.
 """
@@ -7,8 +9,8 @@ several processes, and again.
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +23,18 @@ from data.frames import FrameSet
 from data.importance import importance_candidates, importance_map
 from data.manifest import FrameRecord
 from data.patches import Position
-from data.shards.division import Candidate, Place, ShardPlan, different_samples, kind_of
+from data.shards.clips import clips_of
+from data.shards.division import (
+    Candidate,
+    Place,
+    ShardPlan,
+    chosen_frames,
+    different_samples,
+    kind_of,
+)
 from data.shards.index import write_json
 from data.shards.options import PrepareOptions
-from data.shards.planes import Planes
+from data.shards.planes import Planes, Stored
 from data.shards.write import ShardWriter
 from data.temporal import Accumulator
 
@@ -44,20 +54,26 @@ def make_scene(
     report: Callable[[], None] | None = None,
 ) -> None:
     """Write the given shards of one scene, and a record of each when it is finished."""
-    wanted: dict[int, list[tuple[ShardPlan, Place]]] = {}
+    frames = FrameSet(root)
+    clips = clips_of(chosen_frames(frames, scene, options), options.frames)
+    wanted: dict[int, list[tuple[ShardPlan, Place]]] = {}  # by the last frame
+    needed: set[int] = set()
     for plan in plans:
         for index, place in plan.samples:
-            wanted.setdefault(index, []).append((plan, place))
+            clip = (index,) if plan.frames == 1 else clips[index]
+            wanted.setdefault(clip[-1], []).append((plan, place))
+            needed.update(clip)
     left = Counter({plan.file: len(plan.samples) for plan in plans})
+    held: deque[_Cutter] = deque(maxlen=max(plan.frames for plan in plans))
     with contextlib.ExitStack() as stack:
         writers: dict[str, ShardWriter] = {}
-        for stored in _frames(FrameSet(root), scene, options, set(wanted)):
-            frame, cutter = stored.frame, _Cutter(stored, options)
-            for plan, place in wanted.pop(frame.index):
+        for stored in _frames(frames, scene, options, needed):
+            held.append(_Cutter(stored, options))
+            for plan, place in wanted.pop(stored.frame.index, ()):
                 if plan.file not in writers:
                     path = Path(work) / "shards" / plan.file
                     writers[plan.file] = stack.enter_context(ShardWriter(path, plan.split, plan.scene))
-                cutter.add(writers[plan.file], place)
+                _add(writers[plan.file], place, list(held)[-plan.frames :], options)
                 left[plan.file] -= 1
                 if left[plan.file] == 0:
                     record = writers.pop(plan.file).finish()
@@ -138,6 +154,64 @@ class _Kept:
     per_sample: tuple[int, tuple[str, ...]] | None
 
 
+def _add(writer: ShardWriter, place: Place, cutters: Sequence[_Cutter], options: PrepareOptions) -> None:
+    """Append the sample at a place, unless it was pruned or its reference is black, in all frames of a clip.
+
+    Args:
+        writer: Of its shard.
+        place: Where it is cut; the first frame decides about a candidate.
+        cutters: The frame that it is cut from, or those of a clip.
+        options: How.
+    """
+    position, first = place, cutters[0]
+    if isinstance(position, Candidate):
+        position = first.candidates(writer.split, position.total)[position.number]
+        if position is None:
+            writer.pruned += 1
+            return
+    patch = options.patch_size
+    if position is not None and all(c.kept.planes["reference"].black(position, patch) for c in cutters):
+        writer.skipped += 1  # a black target teaches nothing [authors' code of Fan et al. 2021]
+        return
+    parts = [{name: p.cut(position, patch) for name, p in c.kept.planes.items()} for c in cutters]
+    meta, arrays = first.kept.meta, parts[0]
+    if len(cutters) > 1:
+        meta, arrays = _joined(cutters, parts)
+    height, width = arrays["reference"].shape[-2:]
+    x, y = position if position is not None else (0, 0)
+    first.check_kind(writer)
+    writer.add_stored({**meta, "x": x, "y": y, "width": width, "height": height}, arrays)
+
+
+def _joined(
+    cutters: Sequence[_Cutter], parts: Sequence[dict[str, Stored]]
+) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Return what the JSON of a clip says, and its arrays (N, C, H, W).
+
+    An array that one frame needs in float32 is kept so for all; the others keep the values that half
+    precision gave them.
+
+    Raises:
+        ValueError: The frames differ in what they hold.
+    """
+    first = cutters[0]
+    for cutter, part in zip(cutters, parts, strict=True):
+        if part.keys() != parts[0].keys():
+            kinds = [f"{c.frame.label} has {', '.join(c.kept.planes)}" for c in (first, cutter)]
+            raise ValueError(f"frames of one clip hold other buffers: {'; '.join(kinds)}; name fewer, --only")
+        if cutter.frame.accumulated != first.frame.accumulated:
+            raise ValueError(
+                f"{cutter.frame.label} and {first.frame.label} are in one clip, and one of them is "
+                "accumulated; take other frames, or --accumulate"
+            )
+    meta = {
+        **first.kept.meta,
+        "depth_range": [cutter.kept.meta["depth_range"] for cutter in cutters],
+        "frames": len(cutters),
+    }
+    return meta, {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+
+
 class _Cutter:
     """Cuts one frame.
 
@@ -155,26 +229,7 @@ class _Cutter:
         self._positions: dict[tuple[str, int], list[Position | None]] = {}
         self._map: Any = None
 
-    def add(self, writer: ShardWriter, place: Place) -> None:
-        """Append the sample at a place, unless it was pruned or its reference is black."""
-        position = place
-        if isinstance(place, Candidate):
-            position = self._candidates(writer.split, place.total)[place.number]
-            if position is None:
-                writer.pruned += 1
-                return
-        assert not isinstance(position, Candidate)
-        patch, planes = self.options.patch_size, self.kept.planes
-        if position is not None and planes["reference"].black(position, patch):
-            writer.skipped += 1  # a black target teaches nothing [authors' code of Fan et al. 2021]
-            return
-        arrays = {name: plane.cut(position, patch) for name, plane in planes.items()}
-        height, width = arrays["reference"].shape[-2:]
-        x, y = position if position is not None else (0, 0)
-        self._check_kind(writer)
-        writer.add_stored({**self.kept.meta, "x": x, "y": y, "width": width, "height": height}, arrays)
-
-    def _check_kind(self, writer: ShardWriter) -> None:
+    def check_kind(self, writer: ShardWriter) -> None:
         """Check that the samples of a shard are all of one kind, which a manifest can have wrong."""
         kind = self.kept.per_sample
         if writer.samples and writer.per_sample != kind:
@@ -182,7 +237,8 @@ class _Cutter:
             raise ValueError(different_samples(kinds | {kind_of(kind): self.frame.label}))
         writer.per_sample = kind
 
-    def _candidates(self, split: str, count: int) -> list[Position | None]:
+    def candidates(self, split: str, count: int) -> list[Position | None]:
+        """Return the positions of all candidates of the frame, None where one is pruned."""
         known = self._positions.get((split, count))
         if known is None:
             frame, options = self.frame, self.options

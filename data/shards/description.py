@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 
 from data.buffers import BUFFERS, SAMPLES, THIN_LENS, sample_channels
+from data.shards.options import LONGEST_CLIP
 
 DTYPES = {"<f2": torch.float16, "<f4": torch.float32}
 LARGEST_TEXT = 1 << 20
@@ -24,8 +25,8 @@ LARGEST_SIDE = 1 << 17
 
 
 class Stored(NamedTuple):
-    """Where an array of a sample lies: type, shape, (C, H, W) or (S, C, H, W), and first value, counted in
-    that type from the beginning of the sample."""
+    """Where an array of a sample lies: type, shape, and first value, counted in that type from the beginning
+    of the sample. The shape is (C, H, W), (S, C, H, W) of `samples`, (N, C, H, W) in a clip of N frames."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -33,13 +34,16 @@ class Stored(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What is known of a sample beside its pixels."""
+    """What is known of a sample beside its pixels.
+
+    Of a clip, `frame` and `exposure` are those of its first frame, and `depth_range` has a pair for each.
+    """
 
     key: str
     scene: str
     frame: int
     exposure: float
-    depth_range: tuple[float, float]
+    depth_range: tuple[float, ...]
     accumulated: bool
     height: int
     width: int
@@ -47,6 +51,7 @@ class Sample(NamedTuple):
     buffers: dict[str, Stored]
     sample_channels: tuple[str, ...] = ()
     thin_lens: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frames: int = 1
 
 
 def parse(key: str, raw: memoryview, shard: int) -> Sample:
@@ -91,24 +96,24 @@ def _sample(key: str, meta: dict[str, Any], shard: int, start: int, end: int) ->
     channels = tuple(text(name, "sample_channels") for name in meta.get("sample_channels", ()))
     if channels != sample_channels(*dict.fromkeys(name.partition(".")[0] for name in channels)):
         raise ValueError("its sample_channels are not those of known quantities, one after another")
+    frames = whole(meta.get("frames", 1), "frames", 1, LONGEST_CLIP)
     buffers: dict[str, Stored] = {}
     free = start
     for entry in meta["buffers"]:
-        name, stored, size = _stored(entry, start, (height, width), len(channels))
+        name, stored, size = _stored(entry, start, (height, width), len(channels), frames)
         first = stored.start * stored.dtype.itemsize
         if first < free or first + size > end or name in buffers:
             raise ValueError(f"{name} does not lie within the sample and beside its other buffers")
         buffers[name], free = stored, first + size
     if not buffers:
         raise ValueError("it has no buffers")
-    low, high = (number(value, "depth_range") for value in meta["depth_range"])
     aperture, focus, view = (number(value, THIN_LENS) for value in meta.get(THIN_LENS, (0.0, 0.0, 0.0)))
     return Sample(
         key,
         text(meta["scene"], "scene"),
         whole(meta["frame"], "frame", -(2**62), 2**62),
         number(meta["exposure"], "exposure"),
-        (low, high),
+        _depth_range(meta["depth_range"], frames),
         bool(meta["accumulated"]),
         height,
         width,
@@ -116,11 +121,19 @@ def _sample(key: str, meta: dict[str, Any], shard: int, start: int, end: int) ->
         buffers,
         channels,
         (aperture, focus, view),
+        frames,
     )
 
 
+def _depth_range(told: Any, frames: int) -> tuple[float, ...]:
+    pairs = [told] if frames == 1 else told
+    if len(pairs) != frames:
+        raise ValueError(f"its depth_range has {len(pairs)} pairs, expected {frames}")
+    return tuple(number(value, "depth_range") for low, high in pairs for value in (low, high))
+
+
 def _stored(
-    entry: dict[str, Any], start: int, size: tuple[int, int], channels: int
+    entry: dict[str, Any], start: int, size: tuple[int, int], channels: int, frames: int
 ) -> tuple[str, Stored, int]:
     """Return name, place and bytes of an array."""
     name, dtype = text(entry["name"], "name"), DTYPES.get(text(entry["dtype"], "dtype"))
@@ -128,8 +141,10 @@ def _stored(
         raise ValueError(f"{name} has type {entry['dtype']!r}, expected {' or '.join(DTYPES)}")
     shape = tuple(whole(side, "shape", 1, LARGEST_SIDE) for side in entry["shape"])
     expected = channels if name == SAMPLES else BUFFERS[name].channels if name in BUFFERS else None
-    if len(shape) != (4 if name == SAMPLES else 3) or shape[-2:] != size:
+    if len(shape) != (4 if name == SAMPLES or frames > 1 else 3) or shape[-2:] != size:
         raise ValueError(f"{name} has the shape {shape}, in a sample of {size[0]} rows and {size[1]} columns")
+    if frames > 1 and (name == SAMPLES or shape[0] != frames):
+        raise ValueError(f"{name} has the shape {shape}, in a clip of {frames} frames")
     if expected is not None and shape[-3] != expected:
         raise ValueError(f"{name} has {shape[-3]} channels, expected {expected}")
     first = start + whole(entry["offset"], "offset", 0, 2**48)

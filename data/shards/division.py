@@ -23,6 +23,7 @@ from data.patches import (
     patch_count,
     uniform_positions,
 )
+from data.shards.clips import clip_counts, lacking, listed
 from data.shards.options import PrepareOptions
 
 FRAMES_PER_SHARD = 8
@@ -48,12 +49,16 @@ Place = Position | Candidate | None
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """One shard to be written: its samples as frame index and place."""
+    """One shard to be written: its samples as index of the first frame and place.
+
+    `frames`: consecutive frames of a sample.
+    """
 
     file: str
     split: str
     scene: str
     samples: tuple[tuple[int, Place], ...]
+    frames: int = 1
 
 
 @dataclass(frozen=True)
@@ -68,8 +73,8 @@ def plan_shards(frames: FrameSet, options: PrepareOptions) -> list[ShardPlan]:
     """Return all shards of a data set, in the order of split, scene and frame.
 
     Raises:
-        ValueError: No frame is for training, a frame is smaller than a patch, or samples that are kept apart
-            do not agree.
+        ValueError: No frame is for training, no scene has as many consecutive frames as a clip, a frame is
+            smaller than a patch, or samples that are kept apart do not agree or are asked for in clips.
     """
     plans = []
     sources = _sources(frames, options)
@@ -79,10 +84,12 @@ def plan_shards(frames: FrameSet, options: PrepareOptions) -> list[ShardPlan]:
         limit = FRAMES_PER_SHARD if split == "test" else options.samples_per_shard
         if split == "train":
             limit = min(limit, max(1, sum(map(len, lists.values())) // MIN_TRAIN_SHARDS))
+        frames_each = 1 if split == "test" else options.frames
         number = 0
         for scene, samples in lists.items():
             for part in _parts(samples, limit):
-                plans.append(ShardPlan(f"{split}-{number:05d}.tar", split, scene, tuple(part)))
+                file = f"{split}-{number:05d}.tar"
+                plans.append(ShardPlan(file, split, scene, tuple(part), frames_each))
                 number += 1
     return plans
 
@@ -99,6 +106,7 @@ def _sources(frames: FrameSet, options: PrepareOptions) -> dict[str, _Source]:
             f"{frames.root} has no training frame with --spp {' '.join(map(str, options.spp))}; its frames "
             f"have {', '.join(map(str, known)) or 'no record of their'} samples per pixel"
         )
+    _leave_out_short(frames, chosen, options)
     train, validation = _Source(chosen["train"]), _Source(chosen["validation"])
     if not frames.scenes("validation"):
         validation = _Source(chosen["train"], own=False)
@@ -108,11 +116,41 @@ def _sources(frames: FrameSet, options: PrepareOptions) -> dict[str, _Source]:
 
 
 def _selected(frames: FrameSet, split: str, options: PrepareOptions) -> dict[str, list[FrameRecord]]:
-    found = {
-        scene: [r for r in frames.frames(scene) if not options.spp or r.spp in options.spp]
-        for scene in frames.scenes(split)
-    }
+    found = {scene: chosen_frames(frames, scene, options) for scene in frames.scenes(split)}
     return {scene: records for scene, records in found.items() if records}
+
+
+def chosen_frames(frames: FrameSet, scene: str, options: PrepareOptions) -> list[FrameRecord]:
+    """Return the frames of a scene with the samples per pixel that are asked for, in ascending order."""
+    return [r for r in frames.frames(scene) if not options.spp or r.spp in options.spp]
+
+
+def left_out(frames: FrameSet, options: PrepareOptions) -> list[str]:
+    """Return what to say of scenes for training and validation that no clip fits into: a line, or none."""
+    chosen = {**_selected(frames, "train", options), **_selected(frames, "validation", options)}
+    short = lacking(frames, chosen, options.frames)
+    many = f"{len(short)} scenes were" if len(short) > 1 else "1 scene was"
+    needed = f"clips need {options.frames} consecutive frames of a sequence"
+    return [f"{many} left out, {needed}: {listed(short)}"] if short else []
+
+
+def _leave_out_short(
+    frames: FrameSet, chosen: dict[str, dict[str, list[FrameRecord]]], options: PrepareOptions
+) -> None:
+    """Take the scenes that no clip fits into out of training and validation.
+
+    Raises:
+        ValueError: Nothing is left; names them.
+    """
+    for split, kind in (("train", "training"), ("validation", "validation")):
+        short = lacking(frames, chosen[split], options.frames)
+        if short and len(short) == len(chosen[split]) and (split == "train" or options.validation_patches):
+            raise ValueError(
+                f"{frames.root} has no {kind} scene with {options.frames} consecutive frames of one "
+                f"sequence: {listed(short)}; take shorter clips, --clip-frames N (in training --data.frames "
+                "N), or longer sequences"
+            )
+        chosen[split] = {scene: records for scene, records in chosen[split].items() if scene not in short}
 
 
 def _held_out(scenes: dict[str, list[FrameRecord]], options: PrepareOptions) -> tuple[_Source, _Source]:
@@ -145,6 +183,12 @@ def _check_samples(frames: FrameSet, sources: dict[str, _Source], options: Prepa
             for record in records:
                 kind = (record.spp, tuple(record.samples)) if record.samples else None
                 kinds.setdefault(kind, record.file)
+    apart = next((where for kind, where in kinds.items() if kind is not None), None)
+    if options.frames > 1 and apart is not None:
+        raise ValueError(
+            f"{frames.root}: {apart} keeps samples apart, which clips do not hold; leave them out with "
+            "--samples none (in training --data.recipe recurrent)"
+        )
     if len(kinds) > 1:
         raise ValueError(f"{frames.root}: {different_samples(kinds)}")
 
@@ -182,11 +226,11 @@ def _scene_samples(
     if split == "test":
         return [(record.index, None) for record in records]
     number = _per_reference(split, source, options)
+    counts = _counts(records, number, (options.seed, "clips", split, scene), options.frames)
     samples: list[tuple[int, Place]] = []
-    for ordinal, record in enumerate(records):
+    for record, count in counts:
         size = (record.width, record.height)
         label = f"{frames.root / record.file}"
-        count = patch_count(number, *size, ordinal)
         if options.sampling == "importance":
             check_size(size, options.patch_size, label)
             samples += [(record.index, Candidate(i, count)) for i in range(count)]
@@ -195,6 +239,16 @@ def _scene_samples(
             draw = legacy_positions if options.wskp_legacy_crops else uniform_positions
             samples += [(record.index, p) for p in draw(count, size, options.patch_size, seed, label)]
     return samples
+
+
+def _counts(
+    records: list[FrameRecord], number: int, seed: tuple[int | str, ...], length: int
+) -> list[tuple[FrameRecord, int]]:
+    """Return how many patches, or clips that begin there, each frame gives."""
+    if length == 1:
+        return [(r, patch_count(number, r.width, r.height, ordinal)) for ordinal, r in enumerate(records)]
+    begins = clip_counts(records, length, number, seed)
+    return [(record, begins[record.index]) for record in records if record.index in begins]
 
 
 def _per_reference(split: str, source: _Source, options: PrepareOptions) -> int:

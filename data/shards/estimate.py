@@ -24,15 +24,17 @@ class Estimate:
     """What a preparation will give.
 
     Attributes:
-        patches: Training and validation patches; those with a black reference are counted, and of candidates
-            of importance sampling the share that AFGSA kept, which differs from frame to frame.
+        patches: Training and validation patches, or clips; those with a black reference are counted, and of
+            candidates of importance sampling the share that AFGSA kept, which differs from frame to frame.
         frames: Whole frames of the test split.
         bytes: Size of all shards, if every buffer that may be half precision is.
+        clip_frames: Frames of a clip, 1 of patches.
     """
 
     patches: int
     frames: int
     bytes: int
+    clip_frames: int = 1
 
 
 def estimate(frames: FrameSet, options: PrepareOptions) -> Estimate:
@@ -48,16 +50,18 @@ def estimate(frames: FrameSet, options: PrepareOptions) -> Estimate:
             record = records[plan.scene, index]
             pixels = record.width * record.height if place is None else options.patch_size**2
             share = PUBLISHED_SHARE if isinstance(place, Candidate) else 1.0
-            size += share * (pixels * _bytes_per_pixel(record, options) + _SAMPLE_OVERHEAD)
+            size += share * (plan.frames * pixels * _bytes_per_pixel(record, options) + _SAMPLE_OVERHEAD)
             whole += place is None
             patches += 0.0 if place is None else share
-    return Estimate(round(patches), whole, round(size))
+    return Estimate(round(patches), whole, round(size), options.frames)
 
 
 def announcement(root: Path, output: Path, expected: Estimate) -> str:
     """Return the line that is shown before shards are made in the cache."""
+    clips = f"clips of {expected.clip_frames} frames"
+    kind = "patches" if expected.clip_frames == 1 else clips
     return (
-        f"preparing {root.absolute().name}: {expected.patches} patches and {expected.frames} whole frames, "
+        f"preparing {root.absolute().name}: {expected.patches} {kind} and {expected.frames} whole frames, "
         f"about {size_text(expected.bytes)}, in {output}; to choose the place: trainer prepare {root} "
         "--output DIR --processes N, then --data.root DIR"
     )

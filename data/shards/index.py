@@ -16,9 +16,12 @@ from typing import Any
 
 from data import remote
 from data.shards.description import text, whole
+from data.shards.options import LONGEST_CLIP
 
 FORMAT = "penumbra-shards"
-VERSION = 1
+VERSION, CLIP_VERSION = 1, 2
+"""Of an index of single frames; of one whose training and validation samples are clips."""
+
 INDEX = "index.json"
 SPLITS = ("train", "validation", "test")
 LARGEST = 1 << 28
@@ -129,6 +132,11 @@ class Index:
         """Folder or URL, for messages."""
         return str(self.root) if self.url is None else remote.shown(self.url)
 
+    @property
+    def frames(self) -> int:
+        """Consecutive frames of a training or validation sample; test samples are single frames."""
+        return int(self.options.get("frames", 1))
+
     def of(self, split: str) -> tuple[ShardRecord, ...]:
         """Return the shards of a split."""
         return tuple(shard for shard in self.shards if shard.split == split)
@@ -145,7 +153,7 @@ class Index:
         """Write `index.json`, whole or not at all."""
         record = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": VERSION if self.frames == 1 else CLIP_VERSION,
             "manifest_hash": self.manifest_hash,
             "manifest": self.manifest,
             "options": self.options,
@@ -203,7 +211,7 @@ class Index:
         """
         try:
             record = json.loads(data)
-            if record["format"] != FORMAT or record["version"] != VERSION:
+            if record["format"] != FORMAT or record["version"] not in (VERSION, CLIP_VERSION):
                 raise ValueError(f"format {record['format']!r:.80}, version {record['version']!r:.80}")
             shards = tuple(ShardRecord.from_dict(shard) for shard in record["shards"])
             if len({shard.file for shard in shards}) < len(shards):
@@ -212,6 +220,7 @@ class Index:
                 raise ValueError("it names a file without samples")
             if not isinstance(record["manifest"], dict) or not isinstance(record["options"], dict):
                 raise TypeError("manifest and options are no tables")
+            _check_frames(record["options"].get("frames", 1), record["version"])
             return cls(
                 root,
                 text(record["manifest_hash"], "manifest_hash"),
@@ -223,9 +232,10 @@ class Index:
                 url,
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            known = f"{FORMAT} version {VERSION} or {CLIP_VERSION}"
             raise ValueError(
-                f"{source} is not an index of shards that this version reads ({FORMAT} version {VERSION}): "
-                f"{error}; prepare the shards again with: trainer prepare FRAMES --output SHARDS"
+                f"{source} is not an index of shards that this version reads ({known}): {error}; prepare the "
+                "shards again with: trainer prepare FRAMES --output SHARDS"
             ) from error
 
     def _check_sizes(self) -> None:
@@ -239,6 +249,11 @@ class Index:
                     "copy the shard again, or prepare anew: trainer prepare FRAMES --output "
                     f"{self.root} --force"
                 )
+
+
+def _check_frames(frames: Any, version: int) -> None:
+    if (whole(frames, "frames", 1, LONGEST_CLIP) > 1) != (version == CLIP_VERSION):
+        raise ValueError(f"version {version} does not have samples of {frames} frames")
 
 
 def _samples(file: str, records: Any, end: int) -> tuple[SampleRecord, ...]:

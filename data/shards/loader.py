@@ -10,13 +10,16 @@ from __future__ import annotations
 import logging
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from data.shards.batch import Batch, Batches, Order, Packed
+from data.shards.batch import Batches, Order
+from data.shards.index import ShardRecord
+from data.shards.packed import Batch, Packed
 from data.shards.plan import batches_per_epoch, evaluation_samples, shards_ahead, training_epoch
 
 logger = logging.getLogger("data")
@@ -242,6 +245,7 @@ class EvaluationLoader(_Loader):
         world: Number of processes.
         workers: Worker processes.
         pin_memory: Deliver page-locked memory.
+        whole_scenes: All samples of a scene go to one rank, instead of each sample to the next.
     """
 
     def __init__(
@@ -253,9 +257,11 @@ class EvaluationLoader(_Loader):
         world: int = 1,
         workers: int = 0,
         pin_memory: bool = False,
+        whole_scenes: bool = False,
     ) -> None:
         super().__init__(batches, workers, pin_memory)
-        mine = evaluation_samples(len(batches), rank, world).tolist()
+        scenes = _scene_sizes(batches.reader.shards) if whole_scenes else None
+        mine = evaluation_samples(len(batches), rank, world, scenes).tolist()
         self.orders = self._orders_of(0, [mine[i : i + batch_size] for i in range(0, len(mine), batch_size)])
 
     def __len__(self) -> int:
@@ -272,3 +278,11 @@ class EvaluationLoader(_Loader):
             batch["scene"], batch["key"] = [], []
             yield batch
             return
+
+
+def _scene_sizes(shards: Sequence[ShardRecord]) -> list[int]:
+    """Return the number of samples of each scene, in the order of the shards."""
+    return [
+        sum(len(shard.samples) for shard in group)
+        for _, group in groupby(shards, key=lambda shard: shard.scene)
+    ]

@@ -15,6 +15,9 @@ BUFFERS = ("color", "irradiance", "albedo", "normal", "depth", "history", "refer
 GUIDED = ("color", "albedo", "normal", "depth", "reference")
 """What methods without history read."""
 
+LONGEST_CLIP = 1024
+"""Frames of a clip, at most."""
+
 Sampling = Literal["uniform", "importance"]
 KeepSamples = Literal["auto", "half", "none"]
 
@@ -44,6 +47,8 @@ class PrepareOptions:
             `half`: in half precision, radiance clipped to [0, 65504], as the published set of the layer
             method; `none`: left out.
         only: Buffers to keep instead of `BUFFERS`, of every frame that has them.
+        frames: Consecutive frames of a patch. More than one makes clips: the same window of so many frames of
+            a sequence. Patches keep their number per pixel, so that there are about as many times fewer.
         recipe: Name of the recipe that the options began with, for the record.
     """
 
@@ -62,11 +67,12 @@ class PrepareOptions:
     spp: tuple[int, ...] = ()
     samples: KeepSamples = "auto"
     only: tuple[str, ...] = ()
+    frames: int = 1
     recipe: str = ""
 
     def __post_init__(self) -> None:
         lowest = {"patch_size": 1, "train_patches": 1, "validation_patches": 0, "samples_per_shard": 1}
-        for name, low in {**lowest, "candidates": 1}.items():
+        for name, low in {**lowest, "candidates": 1, "frames": 1}.items():
             if getattr(self, name) < low:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected at least {low}")
         for name, kind in (("sampling", Sampling), ("samples", KeepSamples)):
@@ -81,8 +87,20 @@ class PrepareOptions:
             raise ValueError(f"importance_floor is {self.importance_floor}; expected a positive number")
         if self.wskp_legacy_crops and self.sampling == "importance":
             raise ValueError("legacy crops of WSKP are uniform; use them without importance sampling")
+        self._check_clips()
         for name in (*self.buffers, *self.only):
             buffer(name)
+
+    def _check_clips(self) -> None:
+        if self.frames > LONGEST_CLIP:
+            raise ValueError(f"frames is {self.frames}; expected at most {LONGEST_CLIP}")
+        if self.frames > 1 and self.validation_share > 0:
+            raise ValueError(
+                f"validation_share is {self.validation_share}, which holds out single views; clips of "
+                f"{self.frames} frames would run through them: ingest with scenes for validation instead"
+            )
+        if self.frames > 1 and self.samples == "half":
+            raise ValueError("clips hold no samples of each pixel; leave them out with --samples none")
 
     @property
     def stored(self) -> tuple[str, ...]:
@@ -110,6 +128,13 @@ RECIPES: dict[str, dict[str, Any]] = {
         "samples": "half",
         "only": GUIDED,
     },
+    "recurrent": {
+        "frames": 7,
+        "samples_per_shard": 36,
+        "accumulate": False,
+        "samples": "none",
+        "only": GUIDED,
+    },
 }
 """What differs from the defaults for each published method.
 
@@ -117,6 +142,8 @@ bmfr: WSKP's protocol on the BMFR data set, 80 training and 20 validation patche
 et al. 2021, section 5]. afgsa: 400 candidates per frame, pruned, one frame in twenty held out [Yu et al. 2021
 and their code]. layers: Munkberg and Hasselgren 2020 train on a new 128-pixel crop of each frame in every
 epoch; shards hold as many crops as cover a frame's area once, 56 per 1280x720, and samples in half precision.
+recurrent: Chaitanya et al. 2017 train on the same 128-pixel window of seven consecutive frames, of which the
+network makes its own history; 36 clips take as many bytes as the 256 patches of other shards.
 """
 
 

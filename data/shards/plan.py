@@ -78,12 +78,29 @@ def training_epoch(
     return np.resize(samples, (batches, batch_size))
 
 
-def evaluation_samples(total: int, rank: int, world: int) -> Indices:
-    """Return the samples of one rank in an evaluation: every sample once over all ranks.
+def evaluation_samples(total: int, rank: int, world: int, scenes: Sequence[int] | None = None) -> Indices:
+    """Return the samples of one rank in an evaluation, ascending: every sample once over all ranks.
 
     Ranks may get one more or one less; nothing is repeated to make them even.
+
+    Args:
+        total: Number of samples.
+        rank: This process.
+        world: Number of ranks.
+        scenes: Number of samples of each scene, one scene after the other. Where given, a rank gets whole
+            scenes, the largest first and each to who has the fewest samples so far; with fewer scenes than
+            ranks some get none.
     """
-    return np.arange(rank, total, world, dtype=np.int64)
+    if scenes is None:
+        return np.arange(rank, total, world, dtype=np.int64)
+    ends = np.cumsum(scenes)
+    assert total == (ends[-1] if len(ends) else 0)
+    given, mine = [0] * world, np.zeros(total, bool)
+    for scene in sorted(range(len(scenes)), key=lambda scene: -scenes[scene]):
+        owner = given.index(min(given))
+        given[owner] += scenes[scene]
+        mine[ends[scene] - scenes[scene] : ends[scene]] = owner == rank
+    return np.flatnonzero(mine).astype(np.int64)
 
 
 def shards_ahead(shard_sizes: Sequence[int], batches: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:

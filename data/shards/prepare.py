@@ -24,7 +24,14 @@ from data.frames import FrameSet
 from data.jobs import Job, elsewhere
 from data.manifest import MANIFEST
 from data.shards.cut import CUT_VERSION, make_scene
-from data.shards.division import Kind, ShardPlan, different_samples, kind_of, plan_shards
+from data.shards.division import (
+    Kind,
+    ShardPlan,
+    different_samples,
+    kind_of,
+    left_out,
+    plan_shards,
+)
 from data.shards.estimate import announcement, check_room, estimate
 from data.shards.folders import cache_folder
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json
@@ -113,7 +120,8 @@ def prepare_cached(root: Path, options: PrepareOptions, progress: Progress | Non
     output.parent.mkdir(parents=True, exist_ok=True)
     frames = FrameSet(root)
     expected = estimate(frames, options)
-    print(announcement(root, output, expected), file=sys.stderr, flush=True)
+    for line in (announcement(root, output, expected), *left_out(frames, options)):
+        print(line, file=sys.stderr, flush=True)
     check_room(root, output, expected)
     processes = _cache_processes(sum(len(frames.frames(scene)) for scene in frames.scenes()))
     return prepare(root, output, options, processes=processes, wait_for_others=True, progress=progress)

@@ -159,7 +159,8 @@ class ShardReader:
         return known
 
     def array(self, number: int, name: str) -> Tensor:
-        """Return a stored array (C, H, W), `samples` (S, C, H, W), a read-only view of the bytes of the file.
+        """Return a stored array (C, H, W), `samples` (S, C, H, W), of a clip (N, C, H, W): a view, read-only,
+        of the bytes of the file.
 
         Raises:
             ValueError: The sample has no such buffer; the message lists what it has.

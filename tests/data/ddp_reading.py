@@ -1,6 +1,7 @@
-"""Two ranks read shards under Lightning: `python -m tests.data.ddp_reading SHARDS OUTPUT`.
+"""Two ranks read shards under Lightning: `python -m tests.data.ddp_reading SHARDS OUTPUT [FRAMES]`.
 
-Each rank writes what it saw to OUTPUT/<rank>.json.
+Each rank writes what it saw to OUTPUT/<rank>.json. With FRAMES the shards hold clips, and whole scenes are
+tested.
 """
 
 from __future__ import annotations
@@ -37,9 +38,10 @@ class Seen(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def main(shards: str, output: str) -> None:
+def main(shards: str, output: str, frames: str = "1") -> None:
     warnings.simplefilter("ignore")
-    net, data = Seen(), Shards(shards, batch_size=2, buffers=("depth",))
+    clips: dict[str, Any] = {"frames": int(frames), "whole_scenes": int(frames) > 1}
+    net, data = Seen(), Shards(shards, batch_size=2, buffers=("depth",), **clips)
     trainer = Trainer(
         accelerator="cpu",
         devices=2,

@@ -22,7 +22,7 @@ from tests.trainer.test_prepare import ARGUMENTS, command
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_set(tmp_path_factory.mktemp("set") / "frames", frames=4)
+    return write_set(tmp_path_factory.mktemp("set") / "frames", frames=7)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

@@ -230,7 +230,9 @@ def test_samples_of_different_size_need_a_batch_of_one(index: Index):
         Batches(reader, NAMES, True)[Order(0, (0, 1))]
 
 
-@pytest.mark.parametrize("change", [{"version": 2}, {"format": "other"}, {"shards": [{"file": "x"}]}])
+@pytest.mark.parametrize(
+    "change", [{"version": 2}, {"version": 3}, {"format": "other"}, {"shards": [{"file": "x"}]}]
+)
 def test_an_index_of_another_kind_is_refused(index: Index, tmp_path: Path, change: dict):
     record = json.loads((index.root / INDEX).read_text())
     (tmp_path / INDEX).write_text(json.dumps({**record, **change}))

@@ -81,7 +81,7 @@ def bases() -> list[Files]:
     from data.shards.write import ShardWriter
 
     made = []
-    for apart in (False, True):
+    for apart, frames in ((False, 1), (True, 1), (False, 3)):
         with tempfile.TemporaryDirectory() as name:
             root = Path(name)
             generator = np.random.default_rng(1)
@@ -89,31 +89,37 @@ def bases() -> list[Files]:
             for file, split, count in (("train-00000", "train", 2), ("test-00000", "test", 1)):
                 with ShardWriter(root / f"{file}.tar", split, "hall") as writer:
                     for number in range(count):
-                        writer.add_stored(_meta(number, apart), _arrays(generator, apart))
+                        clip = 1 if split == "test" else frames
+                        writer.add_stored(_meta(number, apart, clip), _arrays(generator, apart, clip))
                     if apart:
                         writer.per_sample = (2, tuple(_meta(0, apart)["sample_channels"]))
                     shards.append(writer.finish().to_dict())
             files = {path.name: path.read_bytes() for path in root.iterdir()}
-        about = {"format": "penumbra-shards", "version": 1, "manifest_hash": "ab", "manifest": {}}
-        index = {**about, "options": {}, "skipped": 0, "pruned": 0, "shards": shards}
+        about = {"format": "penumbra-shards", "manifest_hash": "ab", "manifest": {}, "skipped": 0}
+        version = 1 if frames == 1 else 2
+        index = {**about, "version": version, "options": {"frames": frames}, "pruned": 0, "shards": shards}
         made.append({**files, "index.json": json.dumps(index).encode()})
     return made
 
 
-def _meta(number: int, apart: bool) -> dict[str, Any]:
+def _meta(number: int, apart: bool, frames: int = 1) -> dict[str, Any]:
     meta = {"scene": "hall", "frame": number, "x": 0, "y": 0, "width": 8, "height": 8, "exposure": 1.0,
             "depth_range": [0.5, 2.0], "accumulated": True}  # fmt: skip
     if apart:
         channels = [f"{name}.{letter}" for name in ("radiance", "normal") for letter in "RGB"]
         channels[3:] = ["normal.X", "normal.Y", "normal.Z"]
         meta |= {"sample_channels": channels, "thin_lens": [0.0, 1.0, 0.5]}
+    if frames > 1:
+        meta |= {"frames": frames, "depth_range": [[0.5, 2.0 + frame] for frame in range(frames)]}
     return meta
 
 
-def _arrays(generator: Any, apart: bool) -> dict[str, Any]:
+def _arrays(generator: Any, apart: bool, frames: int = 1) -> dict[str, Any]:
     sizes = {"color": 3, "irradiance": 3, "albedo": 3, "normal": 3, "history": 1, "reference": 3}
     arrays = {n: generator.random((c, 8, 8)).astype("<f2") for n, c in sizes.items()}
     arrays["depth"] = generator.random((1, 8, 8)).astype("<f4")
+    if frames > 1:
+        arrays = {n: array[None].repeat(frames, 0) for n, array in arrays.items()}
     if apart:
         arrays["samples"] = generator.random((2, 6, 8, 8)).astype("<f2")
     return arrays
@@ -245,16 +251,18 @@ def read_all(root: Path) -> None:
     """
     from data.augment import Augmentation
     from data.inspection import inspect_path
-    from data.shards.batch import Batches, Order, available
+    from data.shards.batch import Batches, Order
     from data.shards.index import Index
     from data.shards.read import ShardReader
+    from data.shards.shapes import available
 
     index = Index.read(root)
     for split in ("train", "test"):
         reader = ShardReader(index, split)
         for number in range(len(reader)):
             names = available(reader.sample(number))
-            for augmentation in (None, Augmentation("dihedral", seed=number, permute=True, samples=(1, 2))):
+            changes: dict[str, Any] = {"permute": True, "samples": (1, 2), "reverse": 0.5, "freeze": 0.5}
+            for augmentation in (None, Augmentation("dihedral", seed=number, **changes)):
                 batch = Batches(reader, names, temporal=bool(number), augmentation=augmentation)
                 float(
                     sum(

@@ -309,6 +309,8 @@ def test_the_numbers_of_patches_are_those_that_prepare_plans(tmp_path):
     root = made(tmp_path / "set", {"a": frames, "b": [replace(f, scene="b") for f in frames[:1]]})
     rows = {row["recipe"]: row for row in data_page.patch_rows(FrameSet(root))}
     assert list(rows) == [None, *RECIPES]
+    clips = rows.pop("recurrent")
+    assert "no training scene with 7 consecutive frames of one sequence: a is no sequence" in clips["problem"]
     for recipe, row in rows.items():
         options = recipe_options(recipe, {"samples": "none"})
         planned = Counter()
@@ -322,8 +324,24 @@ def test_the_numbers_of_patches_are_those_that_prepare_plans(tmp_path):
 
 def test_sets_that_prepare_would_refuse_say_why_in_place_of_numbers(tmp_path):
     text = report(made(tmp_path / "set", {"a": levels(), "b": levels("classroom")}), tmp_path)[1]
-    assert text.count(".exr is 48x32, smaller than a patch of 128x128") == 1 + len(RECIPES)
+    assert text.count(".exr is 48x32, smaller than a patch of 128x128") == len(RECIPES)
+    assert (
+        text.count(
+            "the set has no training scene with 7 consecutive frames of one sequence: a is no sequence"
+        )
+        == 1
+    )
     assert str(tmp_path) not in text
+
+
+def test_the_number_of_clips_of_sequences_is_told_with_their_length(tmp_path):
+    image = np.ones((144, 320, 3), np.float32)
+    frames = [Frame({"color": image, "reference": image}, "a", i, exposure=1.0) for i in range(8)]
+    sequence = {"sequence": True}
+    root = made(tmp_path / "set", {"a": frames, "b": frames[:1]}, a=sequence, b=sequence)
+    row = next(row for row in data_page.patch_rows(FrameSet(root)) if row["recipe"] == "recurrent")
+    assert row["counts"] == {"train": 80 * 8 // 20 // 7, "validation": 20 * 8 // 20 // 7, "test": 1}
+    assert "80 uniform, 128×128, in clips of 7 frames" in report(root, tmp_path)[1]
 
 
 def test_pairs_that_are_not_shown_are_counted(tmp_path, monkeypatch):

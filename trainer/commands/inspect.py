@@ -235,9 +235,10 @@ def _print_shards(found: Mapping[str, Any], console: Console) -> None:
     _line(console, f"{found['path']}: shards of the data set {found['manifest_hash'][:12]}")
     _line(console, "options: " + ", ".join(f"{k} {v}" for k, v in found["options"].items()))
     for name, split in found["splits"].items():
+        kind = "samples" if split["frames"] == 1 else f"clips of {split['frames']} frames"
         _line(
             console,
-            f"{name}: {split['samples']} samples in {split['shards']} shards, {split['bytes'] / 1e6:.1f} MB",
+            f"{name}: {split['samples']} {kind} in {split['shards']} shards, {split['bytes'] / 1e6:.1f} MB",
         )
         if split["buffers"]:
             console.print(_buffer_table(split["buffers"]))

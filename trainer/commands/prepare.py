@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -26,6 +26,9 @@ recipes, for what the published methods were trained on; other options override 
           validation, not accumulated; color, albedo, normal, depth, reference
   layers  uniform, 56 and 14 patches per 1280x720 frame (training crops cover a frame's area once), not
           accumulated; the same buffers, and samples in half precision, radiance clipped to [0, 65504]
+  recurrent  clips of seven consecutive frames of a sequence for networks with a memory (Chaitanya et al.),
+          uniform, not accumulated; the buffers of afgsa, no samples. A clip counts as a patch of each of its
+          frames: there are about a seventh as many
 
 importance sampling: candidates are thrown over each frame at a distance, then dropped at random, the more the
 less noisy colour and normals vary in the patch; AFGSA kept 258 of 400. Frames without normals are judged by
@@ -44,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SHARDS",
         help="folder to make, or s3://BUCKET/SHARDS, or http(s)://HOST/SHARDS of a server that takes PUT",
     )
-    parser.add_argument("--recipe", choices=("bmfr", "afgsa", "layers"), help="see below (default: none)")
+    parser.add_argument(
+        "--recipe", choices=("bmfr", "afgsa", "layers", "recurrent"), help="see below (default: none)"
+    )
     _add_positions(parser)
     _add_contents(parser)
     parser.add_argument(
@@ -67,6 +72,13 @@ def _add_positions(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("which patches")
     group.add_argument("--sampling", choices=("uniform", "importance"), help="positions (default uniform)")
     group.add_argument("--patch-size", type=int, metavar="N", help="pixels (default 128)")
+    group.add_argument(
+        "--clip-frames",
+        dest="frames",
+        type=int,
+        metavar="N",
+        help="consecutive frames of a patch; more than one make clips, of sequences alone (default 1)",
+    )
     group.add_argument(
         "--train-patches", type=int, metavar="N", help="uniform: per 1280x720 frame (default 80)"
     )
@@ -145,8 +157,10 @@ def check(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Prepare, and print what was made."""
+    from data.frames import FrameSet
     from data.remote import shown, url_of
     from data.root import resolve_root
+    from data.shards.division import left_out
     from data.shards.prepare import prepare
 
     url = url_of(args.output)
@@ -156,8 +170,9 @@ def run(args: argparse.Namespace) -> int:
     if args.processes < 1:
         raise ValueError(f"--processes is {args.processes}; expected at least 1")
     options = _options(args)
+    remarks = left_out(FrameSet(root.path), options)
     if url is not None:
-        _print(shown(url), _publish(root.path, url, options, args), options)
+        _print(shown(url), _publish(root.path, url, options, args), options, remarks)
         return 0
     with _progress(f"preparing {root.path.name}", _unit(options)) as progress:
         index = prepare(
@@ -168,7 +183,7 @@ def run(args: argparse.Namespace) -> int:
             force=args.force,
             progress=progress,
         )
-    _print(args.output, index, options)
+    _print(args.output, index, options, remarks)
     return 0
 
 
@@ -210,11 +225,12 @@ def _unit(options: PrepareOptions) -> str:
     return "candidates" if options.sampling == "importance" else "samples"
 
 
-def _print(output: str, index: Index, options: PrepareOptions) -> None:
+def _print(output: str, index: Index, options: PrepareOptions, remarks: Sequence[str]) -> None:
     size = sum(shard.bytes for shard in index.shards) / 1e6
     print(f"{output}: {len(index.shards)} shards, {size:.1f} MB")
     for split in ("train", "validation", "test"):
-        kind = "frames" if split == "test" else "patches"
+        cut = "patches" if index.frames == 1 else f"clips of {index.frames} frames"
+        kind = "frames" if split == "test" else cut
         print(
             f"  {split:<10} {index.count(split):>6} {kind} of {', '.join(index.scenes(split)) or 'no scene'}"
         )
@@ -228,7 +244,10 @@ def _print(output: str, index: Index, options: PrepareOptions) -> None:
         if bare:
             print(f"  {bare} frames have no normal, so colour alone chose their patches")
     if index.skipped:
-        print(f"  {index.skipped} patches with a black reference were left out")
+        cut = "patches" if index.frames == 1 else "clips"
+        print(f"  {index.skipped} {cut} with a black reference were left out")
+    for remark in remarks:
+        print(f"  {remark}")
 
 
 def _without_normal(index: Index) -> int:

@@ -249,7 +249,7 @@ def patch_rows(frames: FrameSet) -> list[dict[str, Any]]:
             for plan in plan_shards(frames, options):
                 row["counts"][plan.split] += len(plan.samples)
         except ValueError as error:
-            row["problem"] = str(error).replace(f"{frames.root}/", "")
+            row["problem"] = str(error).replace(f"{frames.root}/", "").replace(str(frames.root), "the set")
         rows.append(row)
     return rows
 
