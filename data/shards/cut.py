@@ -24,14 +24,7 @@ from data.importance import importance_candidates, importance_map
 from data.manifest import FrameRecord
 from data.patches import Position
 from data.shards.clips import clips_of
-from data.shards.division import (
-    Candidate,
-    Place,
-    ShardPlan,
-    chosen_frames,
-    different_samples,
-    kind_of,
-)
+from data.shards.division import Candidate, Place, ShardPlan, chosen_frames, different_samples, kind_of
 from data.shards.index import write_json
 from data.shards.options import PrepareOptions
 from data.shards.planes import Planes, Stored
@@ -198,11 +191,14 @@ def _joined(
     for cutter, part in zip(cutters, parts, strict=True):
         if part.keys() != parts[0].keys():
             kinds = [f"{c.frame.label} has {', '.join(c.kept.planes)}" for c in (first, cutter)]
-            raise ValueError(f"frames of one clip hold other buffers: {'; '.join(kinds)}; name fewer, --only")
+            raise ValueError(
+                f"frames of one clip hold different buffers: {'; '.join(kinds)}; name those that all have: "
+                "--only A,B"
+            )
         if cutter.frame.accumulated != first.frame.accumulated:
             raise ValueError(
                 f"{cutter.frame.label} and {first.frame.label} are in one clip, and one of them is "
-                "accumulated; take other frames, or --accumulate"
+                "accumulated; accumulate the others too: --accumulate"
             )
     meta = {
         **first.kept.meta,

@@ -24,14 +24,7 @@ from data.frames import FrameSet
 from data.jobs import Job, elsewhere
 from data.manifest import MANIFEST
 from data.shards.cut import CUT_VERSION, make_scene
-from data.shards.division import (
-    Kind,
-    ShardPlan,
-    different_samples,
-    kind_of,
-    left_out,
-    plan_shards,
-)
+from data.shards.division import Kind, ShardPlan, different_samples, kind_of, left_out, plan_shards
 from data.shards.estimate import announcement, check_room, estimate
 from data.shards.folders import cache_folder
 from data.shards.index import INDEX, VERSION, Index, ShardRecord, write_json

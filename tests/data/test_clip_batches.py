@@ -145,6 +145,22 @@ def test_nothing_moves_in_the_repeated_frames_of_a_frozen_clip(index: Index, mon
             assert (batch["motion"][row, step] == (0 if order[step] in order[:step] else 1)).all()
 
 
+def test_dropped_history_leaves_every_frame_of_an_accumulated_clip_alone(index: Index, tmp_path: Path):
+    options = replace(CLIPS, accumulate=True)
+    made = prepare(index.root.parent / "frames", tmp_path / "shards", options)
+    names = ("irradiance", "history", "color", "albedo")
+    kept, dropped = (
+        Batches(
+            ShardReader(made, "train"), names, True, augmentation=Augmentation("none", drop_history=share)
+        )[Order(0, (0, 1, 2))].unpack()
+        for share in (0.0, 1.0)
+    )
+    assert torch.equal(dropped["irradiance"], dropped["color"] / dropped["albedo"])
+    assert (dropped["history"] == 1).all()
+    counts = kept["history"][:, :, 0, 0, 0] - kept["frame"][:, None]
+    assert torch.equal(counts, torch.tensor([1.0, 2, 3, 4]).expand(3, 4))
+
+
 def test_orders_follow_from_seed_epoch_and_sample_alone_with_the_given_probabilities():
     augmentation = Augmentation(seed=3, reverse=0.25, freeze=0.5)
     orders = [augmentation.frame_order(1, n, 7) for n in range(4000)]
@@ -267,10 +283,11 @@ def test_a_run_resumed_in_the_middle_of_an_epoch_sees_the_clips_that_were_left(
 
 
 def test_clips_through_a_worker_are_those_read_here(index: Index):
-    here, there = (next(iter(module(index, workers).train_dataloader())) for workers in (0, 1))
-    assert here["key"] == there["key"]
-    for name in ("irradiance", "depth", "depth_range", "exposure"):
-        assert torch.equal(here[name], there[name])
+    here, there = (list(module(index, workers).train_dataloader()) for workers in (0, 1))
+    for one, other in zip(here, there, strict=True):
+        assert one["key"] == other["key"]
+        for name in ("irradiance", "depth", "depth_range", "exposure"):
+            assert torch.equal(one[name], other[name])
 
 
 def test_damaged_clips_stop_the_run_unless_skipping_is_asked(index: Index, tmp_path: Path):

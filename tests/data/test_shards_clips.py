@@ -302,6 +302,28 @@ def test_accumulated_clips_hold_the_history_of_each_frame(frames: Path, tmp_path
             assert np.allclose(found, mean, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("no depth", "hall/frame 0 has color, depth, reference; hall/frame 1 has color, reference; name"),
+        ("accumulated", "hall/frame 1 and hall/frame 0 are in one clip, and one of them is accumulated"),
+    ],
+)
+def test_frames_that_hold_different_things_make_no_clip(tmp_path: Path, change: str, message: str):
+    root, records = tmp_path / "frames", []
+    for i in range(3):
+        made = frame("hall", i)
+        if change == "accumulated":
+            made = replace(made.with_buffers(irradiance=made.buffers["color"]), accumulated=i == 1)
+        elif i == 1:
+            made = replace(made, buffers={n: b for n, b in made.buffers.items() if n != "depth"})
+        records.append(write_record(made, root))
+    splits: dict[str, list[str]] = {"train": ["hall"], "validation": [], "test": []}
+    Manifest("unlike", "penumbra", "euclidean", splits, {"hall": SceneRecord(tuple(records))}).save(root)
+    with pytest.raises(ValueError, match=message):
+        prepare(root, tmp_path / "clips", replace(CLIPS, only=("color", "depth")))
+
+
 def test_importance_of_the_first_frame_decides_where_a_clip_is_cut(tmp_path: Path):
     root = write_set(tmp_path / "frames", frames=4, calm=True)
     options = replace(CLIPS, sampling="importance", candidates=8000)

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--samples-per-shard",
         type=int,
         metavar="N",
-        help="patches, or candidates, in a shard at most (default 256)",
+        help="patches, candidates or clips in a shard at most (default 256; recurrent: 36)",
     )
     parser.add_argument(
         "--processes",
@@ -77,7 +77,8 @@ def _add_positions(parser: argparse.ArgumentParser) -> None:
         dest="frames",
         type=int,
         metavar="N",
-        help="consecutive frames of a patch; more than one make clips, of sequences alone (default 1)",
+        help="consecutive frames of a patch; more than one make clips, which only sequences give (default 1; "
+        "recurrent: 7)",
     )
     group.add_argument(
         "--train-patches", type=int, metavar="N", help="uniform: per 1280x720 frame (default 80)"
