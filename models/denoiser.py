@@ -74,6 +74,8 @@ class Denoiser(nn.Module):
         frame_halo: Frames on each side that the exact result of a frame depends on.
         recurrent: `forward(buffers, state)` continues a sequence of images with the `Denoised.state` of the
             frame before; None, the default, starts one.
+        state_maps: Map of the state → its channels, and the side of its pixels in pixels of the image: what
+            exported files are given. Zeros start a sequence.
         whole: It looks anywhere in the frames before, so images are not cut into tiles.
         bytes_per_pixel: Working memory of inference per pixel, measured; tiling derives tile sizes from it.
         bytes_once: Working memory that does not grow with the image, such as reordered weights, measured.
@@ -97,6 +99,7 @@ class Denoiser(nn.Module):
     frames: int = 0
     frame_halo: int = 0
     recurrent: bool = False
+    state_maps: Mapping[str, tuple[int, int]] = {}
     whole: bool = False
     bytes_per_pixel: int = 500
     bytes_once: int = 0

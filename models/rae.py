@@ -118,7 +118,6 @@ class RAE(Denoiser):
     frame_numbers = ("exposure", "depth_range")
     recurrent = True
     bytes_per_pixel = 2000
-    no_export = "its hidden state would have to be an input and an output of the file"
 
     def __init__(
         self,
@@ -148,6 +147,7 @@ class RAE(Denoiser):
         self.last = _convolution(tail[1], 3)
         self.multiple = 2 ** len(stages)
         self.halo = _halo(len(stages))
+        self.state_maps = {f"hidden{level}": (width, 1 << level) for level, width in enumerate(outputs)}
 
     def forward(self, buffers: Buffers, state: State | None = None) -> Denoised:
         """Denoise the next frame; see `Denoiser.forward`.
@@ -195,7 +195,7 @@ class RAE(Denoiser):
         if not exporting():
             # oneDNN and cuDNN convolve faster with channels innermost.
             maps = maps.contiguous(memory_format=torch.channels_last)
-        _check_state(state, maps, len(self.encoder))
+        self._check_state(state, maps)
         maps, hidden = _active(self.enter(maps)), {}
         for level, stage in enumerate(self.encoder):
             maps = maps if level == 0 else F.max_pool2d(maps, 2)
@@ -213,6 +213,16 @@ class RAE(Denoiser):
             channels.append(scaled_depth(image, buffers.get("depth_range")) if name == "depth" else image)
         return torch.cat(channels, 1)
 
+    def _check_state(self, state: State | None, maps: Tensor) -> None:
+        """Check that a state is one of an image of this size."""
+        if state is None or exporting():
+            return
+        batch, _, height, width = maps.shape
+        wanted = {n: (batch, c, height // side, width // side) for n, (c, side) in self.state_maps.items()}
+        found = {name: tuple(image.shape) for name, image in state.items()}
+        if found != wanted:
+            raise ValueError(f"the state is that of another batch or size: {found}, expected {wanted}")
+
     def _padded(self, images: Tensor) -> Tensor:
         """Return images on the grid of the network."""
         bottom, right = (-side % self.multiple for side in images.shape[-2:])
@@ -225,17 +235,6 @@ def _tone(image: Tensor) -> Tensor:
     """Return max(image, 0) ** 0.2, whose gradient at 0 is 0 here."""
     clean = finite(image).clamp_max(LARGEST)
     return torch.where(clean > 0, clean.clamp_min(1e-20), 1.0) ** POWER * (clean > 0)
-
-
-def _check_state(state: State | None, maps: Tensor, count: int) -> None:
-    """Check that hidden states are those of an image of this size."""
-    if state is None or exporting():
-        return
-    wanted = [(maps.shape[0], maps.shape[2] >> level, maps.shape[3] >> level) for level in range(count)]
-    held = [state[f"hidden{level}"] for level in range(count) if f"hidden{level}" in state]
-    found = [(maps.shape[0], *maps.shape[-2:]) for maps in held]
-    if found != wanted:
-        raise ValueError(f"the state is that of another batch or size: {found}, expected {wanted}")
 
 
 def _halo(stages: int) -> int:

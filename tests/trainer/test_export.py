@@ -271,7 +271,7 @@ def test_a_foreign_torchscript_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_metadata_of_a_later_version_is_refused() -> None:
-    with pytest.raises(ValueError, match="known up to 2; update penumbra-denoise"):
+    with pytest.raises(ValueError, match="known up to 3; update penumbra-denoise"):
         Description.from_json(json.dumps({"version": 99}))
 
 

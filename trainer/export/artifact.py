@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 
 from data.buffers import SAMPLES, buffer, sample_channels
-from models.denoiser import Denoised
+from models.denoiser import Denoised, State
 from models.ops.per_sample import check_samples, sample_depths
 from trainer.archives import member_sizes
 from trainer.export.description import KEY, Description
-from trainer.export.entry import tracing
+from trainer.export.entry import first_state, tracing
 from trainer.export.torchscript import EXTRA_FILE
 
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".ts"}
@@ -50,8 +50,8 @@ _DAMAGED = (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, Val
 class Runtime(Protocol):
     """Runs one artifact."""
 
-    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
-        """Return the color (B, 3, H, W)."""
+    def __call__(self, feed: dict[str, Tensor]) -> list[Tensor]:
+        """Return the color (B, 3, H, W), and the maps of the next state of a recurrent method."""
 
 
 class Artifact:
@@ -62,6 +62,7 @@ class Artifact:
         inputs, frame_numbers, halo, multiple, temporal, per_sample, samples, fill: As declared by the
             denoiser.
         bytes_per_pixel, bytes_once: Working memory, for tiling.
+        recurrent, state_maps: Whether it carries a state, and what that is.
         frames, frame_halo: 0: exported files take images.
     """
 
@@ -79,19 +80,27 @@ class Artifact:
         self.per_sample = description.per_sample
         self.samples = description.samples
         self.fill = description.fill
+        self.state_maps = description.state
+        self.recurrent = bool(description.state)
         self.bytes_per_pixel = description.bytes_per_pixel
         self.bytes_once = description.bytes_once
         self._runtime = runtime
 
-    def __call__(self, buffers: Mapping[str, Tensor]) -> Denoised:
+    def __call__(self, buffers: Mapping[str, Tensor], state: State | None = None) -> Denoised:
         """Denoise a batch, as `Denoiser.forward` does.
 
         Raises:
             ValueError: A buffer is missing or has another shape.
         """
-        self.check(buffers)
+        batch, height, width = self.check(buffers)
         known = (*self.inputs, *self.frame_numbers)
-        return Denoised(self._runtime({name: buffers[name] for name in known if name in buffers}))
+        feed = {name: buffers[name] for name in known if name in buffers}
+        if not self.recurrent:
+            return Denoised(self._runtime(feed)[0])
+        if state is None:
+            state = first_state(self.state_maps, batch, height, width, self.multiple)
+        color, *maps = self._runtime({**feed, **{name: state[name] for name in self.state_maps}})
+        return Denoised(color, dict(zip(self.state_maps, maps, strict=True)))
 
     def instead(self, available: Collection[str]) -> None:
         """Return nothing: an exported file has one form only."""
@@ -158,10 +167,10 @@ class _OnnxRuntime:
             )
         self.session = onnxruntime.InferenceSession(source, options, [*wanted, "CPUExecutionProvider"])
 
-    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
+    def __call__(self, feed: dict[str, Tensor]) -> list[Tensor]:
         arrays = {name: np.ascontiguousarray(v.detach().float().cpu().numpy()) for name, v in feed.items()}
         try:
-            return torch.from_numpy(self.session.run(None, arrays)[0])
+            return [torch.from_numpy(made) for made in self.session.run(None, arrays)]
         except _runtime_errors() as error:
             first = str(error).splitlines()[0][:200]
             raise OSError(
@@ -174,9 +183,10 @@ class _TorchScript:
         self.module = module
         self.device = device
 
-    def __call__(self, feed: dict[str, Tensor]) -> Tensor:
+    def __call__(self, feed: dict[str, Tensor]) -> list[Tensor]:
         with torch.inference_mode():
-            return self.module({name: value.to(self.device) for name, value in feed.items()})
+            made = self.module({name: value.to(self.device) for name, value in feed.items()})
+        return [made] if isinstance(made, Tensor) else list(made)
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:

@@ -13,8 +13,9 @@ from models.tiling import BYTES_PER_PIXEL
 KEY = "penumbra"
 """Name of the entry in an ONNX file's `metadata_props`; a TorchScript archive holds `penumbra.json`."""
 
-FORMAT_VERSION = 2
-"""1: images. 2: also samples, what stands for quantities that they lack, and working memory."""
+FORMAT_VERSION = 3
+"""1: images. 2: also samples, what stands for what they lack, and working memory. 3: also the state
+of recurrent methods."""
 
 DISTRIBUTION = "penumbra-denoise"
 DEFAULTS: dict[str, tuple[float, ...]] = {
@@ -82,6 +83,7 @@ class Description:
         version: Of this format (`FORMAT_VERSION`).
         versions: Of the distributions that wrote the file.
         bytes_per_pixel, bytes_once: Working memory, as in `models.denoiser.Denoiser`.
+        state: `Denoiser.state_maps`.
     """
 
     model: str
@@ -101,6 +103,7 @@ class Description:
     fill: dict[str, float] = field(default_factory=dict)
     bytes_per_pixel: int = BYTES_PER_PIXEL
     bytes_once: int = 0
+    state: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """Return the description as one JSON object."""
@@ -127,6 +130,7 @@ class Description:
                 parity = Parity(sizes=sizes, counts=counts, **parity)
             for name in ("inputs", "frame_numbers", "samples"):
                 values[name] = tuple(values.get(name, ()))
+            values["state"] = {n: (c, side) for n, (c, side) in values.get("state", {}).items()}
             description = cls(source=Source(**values.pop("source")), parity=parity, **values)
         except (LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             raise ValueError(f"damaged metadata ({error!r}); export the model again") from error
@@ -148,6 +152,8 @@ class Description:
             "multiple": _within(self.multiple, 1, 1 << 16),
             "bytes_per_pixel": _within(self.bytes_per_pixel, 0, 1 << 40),
             "bytes_once": _within(self.bytes_once, 0, 1 << 62),
+            "state": all(_within(n, 1, 1 << 16) for pair in self.state.values() for n in pair)
+            and all(self.multiple % side == 0 for _, side in self.state.values()),
             "temporal": isinstance(self.temporal, bool) and isinstance(self.per_sample, bool),
             "fill": isinstance(self.fill, dict)
             and all(isinstance(v, int | float) for v in self.fill.values()),
@@ -189,6 +195,7 @@ def describe(denoiser: Denoiser, format: str, source: Source | None) -> Descript
             BYTES_PER_PIXEL, denoiser.exported_bytes_per_pixel, int(_MORE_MEMORY * denoiser.bytes_per_pixel)
         ),
         bytes_once=int(denoiser.bytes_once),
+        state={name: (int(c), int(side)) for name, (c, side) in denoiser.state_maps.items()},
         versions={name: installed_version(name) for name in (DISTRIBUTION, "torch", "onnx", "onnxruntime")},
     )
 

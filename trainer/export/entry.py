@@ -27,16 +27,21 @@ class Entry(nn.Module):
     def __init__(self, denoiser: Denoiser) -> None:
         super().__init__()
         self.denoiser = denoiser
-        self.names = (*denoiser.inputs, *denoiser.frame_numbers)
+        self.states = tuple(denoiser.state_maps)
+        self.names = (*denoiser.inputs, *denoiser.frame_numbers, *self.states)
 
-    def forward(self, buffers: dict[str, Tensor]) -> Tensor:
+    def forward(self, buffers: dict[str, Tensor]) -> Tensor | list[Tensor]:
         """Return the color (B, 3, H, W) of buffers (B, C, H, W), samples (B, S, C, H, W) and frame numbers
-        (1 or B, …)."""
-        known = {name: buffers[name] for name in self.names}
+        (1 or B, …); of recurrent methods, which are given their state too, color and the next state."""
+        known = {name: buffers[name] for name in self.names if name not in self.states}
         for name, measured in self.denoiser.measure(known).items():
             if name in known:
                 known[name] = torch.where(torch.isnan(known[name]), measured, known[name])
-        return self.denoiser(known).color
+        if not self.states:
+            color: Tensor = self.denoiser(known).color
+            return color
+        made = self.denoiser(known, {name: buffers[name] for name in self.states})
+        return [made.color, *(made.state[name] for name in self.states)]
 
 
 class Positional(nn.Module):
@@ -46,8 +51,8 @@ class Positional(nn.Module):
         super().__init__()
         self.entry = entry
 
-    def forward(self, *tensors: Tensor) -> Tensor:
-        """Return the color (B, 3, H, W)."""
+    def forward(self, *tensors: Tensor) -> Tensor | list[Tensor]:
+        """Return what the entry does."""
         return self.entry(dict(zip(self.entry.names, tensors, strict=True)))
 
 
@@ -59,12 +64,33 @@ def prepare(denoiser: Denoiser) -> Denoiser:
     """
     if denoiser.no_export:
         raise ValueError(f"{type(denoiser).__name__} cannot be exported: {denoiser.no_export}")
+    if denoiser.recurrent and not denoiser.state_maps:
+        raise ValueError(
+            f"{type(denoiser).__name__} cannot be exported: it does not declare the maps of its state "
+            "(`state_maps`), which would be inputs and outputs of the file"
+        )
     if denoiser.frames:
         raise ValueError(
             f"{type(denoiser).__name__} reads sequences where `frames` is not 0, which exported files "
             "cannot; export it with frames=0"
         )
     return copy.deepcopy(denoiser).deploy().eval().float().cpu().requires_grad_(False)
+
+
+def first_state(
+    maps: Mapping[str, tuple[int, int]], batch: int, height: int, width: int, multiple: int
+) -> dict[str, Tensor]:
+    """Return the state that starts sequences of images, zeros (B, C, h, w), on the CPU.
+
+    Args:
+        maps: `Denoiser.state_maps`.
+        batch: Images.
+        height: Rows of the images.
+        width: Columns of the images.
+        multiple: The method's own grid, to which images are padded.
+    """
+    tall, wide = (-(-side // multiple) * multiple for side in (height, width))
+    return {n: torch.zeros(batch, channels, tall // s, wide // s) for n, (channels, s) in maps.items()}
 
 
 def default(name: str) -> Tensor:

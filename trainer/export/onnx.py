@@ -23,10 +23,15 @@ import torch
 from data.buffers import SAMPLES, sample_channels
 from models.denoiser import Denoiser
 from trainer.export.description import KEY, Description, output_name
-from trainer.export.entry import Entry, Positional, Sampled, default, example, tracing
+from trainer.export.entry import Entry, Positional, Sampled, default, example, first_state, tracing
 
 OPSET = 17
 """ONNX operator set: the oldest one with every operator in use, which ONNX Runtime has since 1.12."""
+
+
+def following(name: str) -> str:
+    """Return the name of the output that is a map of the next frame's state."""
+    return f"next_{name}"
 
 
 def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
@@ -38,14 +43,18 @@ def build(denoiser: Denoiser) -> tuple[bytes, list[str]]:
     axes = dict.fromkeys((*buffers, output), free) | {name: {0: "frames"} for name in given}
     if SAMPLES in buffers:
         axes[SAMPLES] = {0: "batch", 1: "samples", 3: "height", 4: "width"}
+    states = first_state(denoiser.state_maps, 2, 48, 32, denoiser.multiple)
+    for name in states:
+        axes |= {n: {0: "batch", 2: f"{name}_height", 3: f"{name}_width"} for n in (name, following(name))}
     entry = Entry(denoiser).eval()
     # Two rows: the tracer would otherwise see a batch of one and leave out broadcasts.
     tensors = tuple(buffers.values()) + tuple(value.repeat_interleave(2, 0) for value in given.values())
+    tensors += tuple(states.values())
     with tracing() as doubts, torch.inference_mode(), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.onnx"
         torch.onnx.export(
             Positional(entry), tensors, path, dynamo=False, opset_version=OPSET,
-            input_names=list(entry.names), output_names=[output], dynamic_axes=axes,
+            input_names=list(entry.names), output_names=[output, *map(following, states)], dynamic_axes=axes,
         )  # fmt: skip
         model = onnx.load(path)
     for name, value in given.items():
@@ -68,6 +77,15 @@ def describe_file(content: bytes, description: Description) -> bytes:
         model.doc_string += (
             f" `{SAMPLES}` (B, S, C, H, W): any number S of samples per pixel, C channels in this order: "
             f"{channels}. Samples with a channel that is NaN or Inf do not count."
+        )
+    if description.state:
+        maps = ", ".join(
+            f"`{name}` (B, {channels}, H / {side}, W / {side})"
+            for name, (channels, side) in description.state.items()
+        )
+        model.doc_string += (
+            f" State: {maps}, of an image padded to multiples of {description.multiple}. Zeros start a "
+            f"sequence; outputs `{following(next(iter(description.state)))}` … go into the next frame."
         )
     del model.metadata_props[:]
     model.metadata_props.add(key=KEY, value=replace(description, format="onnx").to_json())

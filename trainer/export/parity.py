@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from models.denoiser import Denoiser
+from models.denoiser import Denoised, Denoiser, State
 from trainer.export.artifact import Artifact
 from trainer.export.description import Parity
 from trainer.export.entry import Sampled, example, numbers
@@ -62,22 +62,30 @@ def measure_parity(artifact: Artifact, denoiser: Denoiser, runtime: str, limit: 
         place = f"batch {size[0]}, {size[2]}x{size[1]}"
         if denoiser.per_sample:
             place += f", {count} samples per pixel"
+        state = None
         for buffers in (plain, plain | numbers(denoiser, plain)):
-            expected = denoiser(buffers).color
+            expected = _denoised(denoiser, buffers, state)
             try:
-                found = artifact(buffers).color
-                error, own = agreement(denoiser, buffers, found, expected, limit)
+                found = _denoised(artifact, buffers, state)
+                error, own = agreement(denoiser, buffers, found.color, expected.color, limit, state)
+                _compare_states(found.state, expected.state, limit)
             except Exception as failure:
                 raise ValueError(f"the exported file does not run at {place}: {failure}") from failure
             if own is None:
                 raise ValueError(f"the exported file differs by {error:.2g} at {place}, allowed {limit:g}")
             rounding = max(rounding, own)
             worst = max(worst, error)
+            state = expected.state  # the second goes on from the first where the method is recurrent
     return Parity(worst, limit, SIZES, runtime, rounding, COUNTS if denoiser.per_sample else ())
 
 
 def agreement(
-    denoiser: Denoiser, buffers: Mapping[str, Tensor], found: Tensor, expected: Tensor, limit: float = LIMIT
+    denoiser: Denoiser,
+    buffers: Mapping[str, Tensor],
+    found: Tensor,
+    expected: Tensor,
+    limit: float = LIMIT,
+    state: State | None = None,
 ) -> tuple[float, float | None]:
     """Return how far an artifact's image is from eager's, and the rounding that excuses it.
 
@@ -89,17 +97,32 @@ def agreement(
         found: The artifact's image.
         expected: Eager's.
         limit: Largest error that needs no excuse.
+        state: Of the frame before, for recurrent methods.
     """
     error = relative_error(found, expected)
     if error <= limit:
         return error, 0.0
-    return error, _as_exact(found, expected, _in_double(denoiser, buffers), denoiser.rounding_reach)
+    return error, _as_exact(found, expected, _in_double(denoiser, buffers, state), denoiser.rounding_reach)
 
 
-def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor]) -> Tensor:
+def _in_double(denoiser: Denoiser, buffers: Mapping[str, Tensor], state: State | None) -> Tensor:
     """Return what the module computes in float64."""
     wide = {name: value.double() for name, value in buffers.items()}
-    return copy.deepcopy(denoiser).double()(wide).color
+    before = None if state is None else {name: value.double() for name, value in state.items()}
+    return _denoised(copy.deepcopy(denoiser).double(), wide, before).color
+
+
+def _denoised(method: Denoiser | Artifact, buffers: Mapping[str, Tensor], state: State | None) -> Denoised:
+    made: Denoised = method(buffers) if state is None else method(buffers, state)
+    return made
+
+
+def _compare_states(found: State | None, expected: State | None, limit: float) -> None:
+    """Raise a ValueError where a map differs by more than a share of its largest number."""
+    for name, maps in (expected or {}).items():
+        apart = float((found[name] - maps).abs().amax()) if found else float("inf")
+        if not apart <= limit * float(maps.abs().amax()):
+            raise ValueError(f"its state {name!r} differs by {apart:.2g}")
 
 
 def _as_exact(found: Tensor, eager: Tensor, exact: Tensor, reach: int) -> float | None:

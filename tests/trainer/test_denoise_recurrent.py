@@ -1,0 +1,144 @@
+"""`trainer denoise` and exported files with recurrent methods: the state goes from frame to frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from torch import Tensor
+
+from data.exr import read_frame
+from models import RAE
+from models.denoiser import State
+from tests.trainer.test_denoise_classical import frame, run, write
+from trainer.export import SUFFIXES, export, load_artifact
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+INPUTS = ("irradiance", "albedo", "normal", "depth")
+SIZE = (20, 24)
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def network() -> RAE:
+    torch.manual_seed(2)
+    return RAE(stages=(4, 5), tail=(6, 5)).eval()
+
+
+@pytest.fixture(scope="module")
+def files(network: RAE, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("exported")
+    paths = {format: folder / f"rae{suffix}" for format, suffix in SUFFIXES.items()}
+    for format, path in paths.items():
+        export(network, path, format)  # type: ignore[arg-type]
+    return paths
+
+
+def clip(folder: Path, indices: range | tuple[int, ...] = range(COUNT), size: tuple[int, int] = SIZE) -> Path:
+    for index in indices:
+        write(folder / f"f{index:03d}.exr", frame(*INPUTS, size=size, seed=index, index=index))
+    return folder
+
+
+def expected(network: RAE, folder: Path, starts: tuple[int, ...] = (0,)) -> np.ndarray:
+    """Denoise the frames of a folder in order; sequences begin at the places `starts`."""
+    colors, state = [], None
+    for place, path in enumerate(sorted(folder.glob("*.exr"))):
+        read = read_frame(path).buffers
+        buffers: dict[str, Tensor] = {
+            n: torch.from_numpy(read[n].transpose(2, 0, 1).copy())[None] for n in INPUTS
+        }
+        with torch.no_grad():
+            color, state, _ = network(buffers, None if place in starts else state)
+        colors.append(color[0].permute(1, 2, 0).numpy())
+    return np.stack(colors)
+
+
+def denoised(source: Path, output: Path, model: Path, *arguments: str) -> np.ndarray:
+    assert run(source, "--model", model, "--output", output, "--exposure", "1", *arguments) == 0
+    return np.stack([read_frame(path).buffers["color"] for path in sorted(output.rglob("*.exr"))])
+
+
+def close(found: np.ndarray, wanted: np.ndarray) -> None:
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("format", sorted(SUFFIXES))
+def test_the_state_goes_from_frame_to_frame(
+    network: RAE, files: dict[str, Path], tmp_path: Path, format: str
+) -> None:
+    source = clip(tmp_path / "in")
+    whole, alone = expected(network, source), expected(network, source, tuple(range(COUNT)))
+    assert np.abs(whole[-1] - alone[-1]).max() > 0.02 * np.abs(whole[-1]).max()
+    close(denoised(source, tmp_path / "out", files[format]), whole)
+
+
+def test_the_state_is_cut_into_tiles(network: RAE, files: dict[str, Path], tmp_path: Path) -> None:
+    source = clip(tmp_path / "in", size=(150, 140))
+    # Too little for one piece: what a pixel takes is in the file.
+    found = denoised(source, tmp_path / "out", files["onnx"], "--memory", "50M")
+    close(found, expected(network, source))
+
+
+def test_a_missing_frame_starts_a_sequence(network: RAE, files: dict[str, Path], tmp_path: Path) -> None:
+    source = clip(tmp_path / "in", (0, 1, 4, 5))
+    close(denoised(source, tmp_path / "out", files["onnx"]), expected(network, source, (0, 2)))
+
+
+def test_a_single_frame_is_told_to_be_the_first_of_a_sequence(
+    network: RAE, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = clip(tmp_path / "in", (4,))
+    close(denoised(source, tmp_path / "out", files["onnx"]), expected(network, source))
+    assert "a single frame: " in (told := "".join(capsys.readouterr()))
+    assert "denoises it as the first of a sequence" in told
+
+
+def test_frames_of_another_size_start_a_sequence(
+    network: RAE, files: dict[str, Path], tmp_path: Path
+) -> None:
+    source = clip(tmp_path / "in", (0, 1))
+    clip(source, (2, 3), size=(16, 28))
+    assert run(source, "--model", files["onnx"], "--output", tmp_path / "out", "--exposure", "1") == 0
+    small = clip(tmp_path / "small", (2, 3), size=(16, 28))
+    found = [read_frame(tmp_path / "out" / f"f{index:03d}.exr").buffers["color"] for index in (2, 3)]
+    close(np.stack(found), expected(network, small))
+
+
+def test_files_name_their_state_and_how_a_sequence_starts(files: dict[str, Path]) -> None:
+    model = onnx.load(files["onnx"])
+    assert [i.name for i in model.graph.input][-3:] == ["hidden0", "hidden1", "hidden2"]
+    assert [o.name for o in model.graph.output] == ["color", "next_hidden0", "next_hidden1", "next_hidden2"]
+    assert "Zeros start a sequence" in model.doc_string
+    assert load_artifact(files["onnx"]).state_maps == {
+        "hidden0": (4, 1),
+        "hidden1": (5, 2),
+        "hidden2": (5, 4),
+    }
+
+
+def test_torchscript_carries_the_state_without_penumbra(network: RAE, files: dict[str, Path]) -> None:
+    module = torch.jit.load(files["torchscript"])
+    frames = [
+        {
+            n: torch.from_numpy(b.transpose(2, 0, 1).copy())[None]
+            for n, b in frame(*INPUTS, seed=s).buffers.items()
+        }
+        for s in range(2)
+    ]
+    before = {
+        name: torch.zeros(1, c, 20 // side, 24 // side) for name, (c, side) in network.state_maps.items()
+    }
+    color, *maps = module({**frames[0], **before})
+    color, *maps = module({**frames[1], **dict(zip(before, maps, strict=True))})
+    state: State | None = None
+    with torch.no_grad():
+        for given in frames:
+            wanted, state, _ = network(given, state)
+    close(color.detach().numpy(), wanted.numpy())
+    with pytest.raises(torch.jit.Error, match="missing state hidden0; zeros start a sequence"):
+        module(frames[0])
