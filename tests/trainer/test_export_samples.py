@@ -140,7 +140,7 @@ def test_a_description_of_the_first_version_is_read() -> None:
 def test_a_reader_of_the_first_version_asks_for_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
     new = describe(net("Layer"), "onnx", None).to_json()
     monkeypatch.setattr(descriptions, "FORMAT_VERSION", 1)
-    with pytest.raises(ValueError, match="version 2, known up to 1; update penumbra-denoise"):
+    with pytest.raises(ValueError, match="version 3, known up to 1; update penumbra-denoise"):
         Description.from_json(new)
 
 
