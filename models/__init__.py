@@ -16,6 +16,7 @@ from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
+from models.mrkp import MRKP
 from models.nbgd import NBGD
 from models.rae import RAE
 from models.sbmc import SBMC
@@ -27,6 +28,7 @@ __all__ = [
     "AFGSA",
     "KP",
     "KPCN",
+    "MRKP",
     "NBGD",
     "NFOR",
     "NLM",

@@ -102,7 +102,7 @@ class MultiResolutionWSKP(Denoiser):
         self.unet = AverageUNet(FEATURES, width, levels, [maps + 1] * (resolutions - 1) + [maps])
         self.multiple = 2**levels
         radius = max(self.kernel_sizes) // 2
-        self.halo = max(self.unet.halo(radius), radius * 2 ** (resolutions - 1))
+        self.halo = max(self.unet.halo([radius] * resolutions), radius * 2 ** (resolutions - 1))
 
     def forward(self, buffers: Buffers) -> Denoised:
         """Denoise; see `Denoiser.forward`.

@@ -60,15 +60,16 @@ class AverageUNet(nn.Module):
                 made.append(self.heads[len(skips)](maps))
         return made[::-1]
 
-    def halo(self, needed: int) -> int:
+    def halo(self, needed: Sequence[int]) -> int:
         """Return how many pixels around a core on the grid of 2**levels the outputs depend on.
 
         Args:
-            needed: Pixels of its own resolution around the core at which every output is needed.
+            needed: For every output the pixels of its own resolution around the core at which it is needed;
+                below and to the right of the core at least.
         """
         reach, joined = 0, []
         for level in range(len(self.encoder)):
-            reach = max(reach, needed + 1) if level < len(self.heads) else reach
+            reach = max(reach, needed[level] + 1) if level < len(self.heads) else reach
             joined.append(reach)
             # The last row of a doubled image also depends on the next one of its source.
             reach = reach // 2 + 1

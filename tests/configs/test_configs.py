@@ -17,6 +17,7 @@ OVERLAYS |= {
 }
 OVERLAYS["layers_optimized_sample.yaml"] = "layers_optimized.yaml"
 OVERLAYS |= {"kp1_bmfr.yaml": "kp_bmfr.yaml", "kp2_bmfr.yaml": "kp_bmfr.yaml"}
+OVERLAYS["mrkp_meng.yaml"] = "mrkp_bmfr.yaml"
 """Overlay → what it is laid over."""
 
 NARROW = {

@@ -21,7 +21,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
-KERNEL_METHODS = {"KP", "KPCN", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "SBMC", *LAYERS}
+KERNEL_METHODS = {
+    *("KP", "KPCN", "MRKP", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "SBMC"),
+    *LAYERS,
+}
 """Outputs are sums of input pixels whose weights sum to 1: a constant image stays constant."""
 
 CLEANING = {"ACFM", "AFGSA", "KPCN", "NBGD", "RAE", "SBMC", *LAYERS}
@@ -38,6 +41,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "AFGSA": {"width": 16, "blocks": 2, "heads": 2},
     "KPCN": {"width": 8, "layers": 3, "kernel_size": 7},
     "ACFM": {"blocks": 2, "width": 16, "condition_width": 16, "condition": 8},
+    "MRKP": {"width": 16},
     "MultiResolutionWSKP": {"width": 16},
     "NFOR": {"window": 1, "patch": 1, "prefilter_window": 1, "final_window": 1},
     "NLM": {"window": 2, "patch": 1},
