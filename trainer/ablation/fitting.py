@@ -96,7 +96,7 @@ def fit(training: Training, identity: str, tags: Mapping[str, str], logs: Path, 
     environment[TRAINING_VARIABLE] = launch.identity
     log = logs / f"{folder_of(training.variant.name)}.txt"
     logs.mkdir(parents=True, exist_ok=True)
-    with log.open("w") as kept:
+    with log.open("a") as kept:
         process = subprocess.Popen(
             [*COMMAND, *training.command(tags)],
             stdin=subprocess.DEVNULL,
