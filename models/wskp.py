@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from models.blocks.rep import SIZE, RepBlock, chain
 from models.denoiser import Buffers, Denoised, Denoiser
+from models.ops.kernel_views import VIEWS_BYTES, full_size, kernel_views
 from models.ops.sharing import reconstruct
 from models.ops.ten_channels import FEATURES, depth_bounds, ten_channels
 from models.ops.tonemap import gamma
@@ -66,11 +67,15 @@ class WSKP(Denoiser):
         batch_norm: Branches are batch-normalised, as in the original RepVGG.
         branches: Blocks train 5x5, 3x3, 1x1 and identity branches; False: only 5x5.
         temporal: `irradiance` is expected to be accumulated over the preceding frames.
+
+    Attributes:
+        aux: Return what each kernel makes as `Denoised.aux` (`models.ops.kernel_views`): the image that it
+            filters, its fusion weight, its log-importance.
     """
 
     inputs = ("irradiance", "albedo", "normal", "depth")
     frame_numbers = ("exposure", "depth_range")
-    bytes_per_pixel = 250  # resident memory grows by 180 at 1280x720, 140 when deployed
+    aux = False
 
     def __init__(
         self,
@@ -106,8 +111,16 @@ class WSKP(Denoiser):
         """
         kernels = self.predict(buffers)
         irradiance = buffers["irradiance"]
-        filtered = reconstruct(irradiance, *kernels, self.kernel_sizes)
-        return Denoised(filtered * buffers["albedo"])
+        color = reconstruct(irradiance, *kernels, self.kernel_sizes) * buffers["albedo"]
+        if not self.aux:
+            return Denoised(color)
+        views = kernel_views(irradiance, *kernels, self.kernel_sizes)
+        return Denoised(color, aux=full_size(views, 1, buffers["albedo"]))
+
+    @property
+    def bytes_per_pixel(self) -> int:  # type: ignore[override]
+        """Resident memory grows by 180 at 1280x720, 140 when deployed; what `aux` holds is added."""
+        return 250 + self.aux * VIEWS_BYTES * len(self.kernel_sizes)
 
     def predict(self, buffers: Buffers) -> Kernels:
         """Return importance maps and fusion logits, from the same buffers as `forward`.
@@ -146,4 +159,5 @@ class WSKP(Denoiser):
             temporal=self.temporal,
         )
         copy.blocks = nn.ModuleList(blocks)
+        copy.aux = self.aux
         return copy.eval()

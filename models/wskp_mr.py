@@ -36,6 +36,7 @@ from torch import Tensor
 from models.blocks.average_unet import AverageUNet
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops.boxes import exporting
+from models.ops.kernel_views import VIEWS_BYTES, full_size, kernel_views
 from models.ops.precision import wide
 from models.ops.resolutions import blended, resolutions
 from models.ops.sharing import reconstruct
@@ -70,13 +71,18 @@ class MultiResolutionWSKP(Denoiser):
         curve: Tone curve of the colour that the network sees.
         temporal: `irradiance` is expected to be accumulated over the preceding frames.
 
+    Attributes:
+        aux: Return what each kernel makes in each resolution, in full size, as `Denoised.aux`:
+            `x1_kernel03_…` (`models.ops.kernel_views`) at full resolution, `x2_…` of means over 2x2 pixels,
+            and `x1_alpha`, the share of the coarser result.
+
     Raises:
         ValueError: An argument is out of range; the message names it.
     """
 
     inputs = ("irradiance", "albedo", "normal", "depth")
     frame_numbers = ("exposure", "depth_range")
-    bytes_per_pixel = 1200  # resident memory grows by 1000 at 1280x720
+    aux = False
 
     def __init__(
         self,
@@ -122,7 +128,13 @@ class MultiResolutionWSKP(Denoiser):
             filtered = reconstruct(image, level.log_importance, level.fusion_logits, self.kernel_sizes)
             result = filtered if level.alpha is None else blended(filtered, result, level.alpha)
         height, width = buffers["albedo"].shape[-2:]
-        return Denoised(result[..., :height, :width].clamp_min(0.0) * buffers["albedo"])
+        color = result[..., :height, :width].clamp_min(0.0) * buffers["albedo"]
+        return Denoised(color, aux=self._views(images, predicted, buffers["albedo"]) if self.aux else None)
+
+    @property
+    def bytes_per_pixel(self) -> int:  # type: ignore[override]
+        """Resident memory grows by 1000 at 1280x720; what `aux` holds is added."""
+        return 1200 + self.aux * VIEWS_BYTES * len(self.unet.heads) * len(self.kernel_sizes)
 
     def predict(self, buffers: Buffers) -> list[Level]:
         """Return what the network predicts, from fine to coarse, of images padded to multiples of 32.
@@ -144,6 +156,17 @@ class MultiResolutionWSKP(Denoiser):
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:
         """Return `depth_range` (B, 2): smallest and largest depth of whole frames."""
         return {"depth_range": depth_bounds(buffers["depth"])}
+
+    def _views(self, images: list[Tensor], predicted: list[Level], albedo: Tensor) -> dict[str, Tensor]:
+        """Return what each kernel makes, and the shares of coarser results, by name and in full size."""
+        made: dict[str, Tensor] = {}
+        for number, (image, level) in enumerate(zip(images, predicted, strict=True)):
+            views = kernel_views(image, level.log_importance, level.fusion_logits, self.kernel_sizes)
+            if level.alpha is not None:
+                views["alpha"] = level.alpha
+            factor = 2**number
+            made |= {f"x{factor}_{name}": view for name, view in full_size(views, factor, albedo).items()}
+        return made
 
     def _level(self, made: Tensor) -> Level:
         count = len(self.kernel_sizes)

@@ -33,6 +33,7 @@ COMMANDS = {
     "sync": "send to the tracking server what a run could not deliver yet",
     "submit": "run a training, or many independent jobs, on a Ray cluster",
     "tune": "search hyper-parameters with Ray Tune",
+    "ablate": "train variants of a configuration and tabulate them",
     "serve": "denoise over HTTP",
 }
 

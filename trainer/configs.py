@@ -8,6 +8,8 @@ from pathlib import Path
 DEFAULTS = "defaults.yaml"
 SEARCH = "search"
 """Folder of what `trainer tune` varies; those files are no configurations."""
+ABLATIONS = "ablations"
+"""Folder of what `trainer ablate` compares; likewise."""
 
 
 class UsageError(ValueError):
@@ -27,7 +29,7 @@ def names() -> list[str]:
     return sorted(
         str(p.relative_to(base))
         for p in base.rglob("*.yaml")
-        if p.name != DEFAULTS and p.parent.name != SEARCH
+        if p.name != DEFAULTS and p.parent.name not in (SEARCH, ABLATIONS)
     )
 
 

@@ -124,7 +124,8 @@ def _with_aux(loaded: Loaded) -> Loaded:
     if not isinstance(getattr(loaded.model, "aux", None), bool):
         raise UsageError(
             f"--aux: {loaded.source.reference} gives an image and nothing else; checkpoints of "
-            "Layer and Optimized give their layers, NFOR its errors and features"
+            "Layer and Optimized give their layers, those of WSKP what each kernel makes, NFOR its errors "
+            "and features"
         )
     loaded.model.aux = True  # type: ignore[union-attr]  # checked above
     return loaded

@@ -16,6 +16,7 @@ from trainer.clips import Item
 from trainer.denoising import Result
 from trainer.outputs import replacing
 from trainer.samples import layer_pictures
+from trainer.weights import SHEET, weight_pictures
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
@@ -31,6 +32,7 @@ class Wanted:
         attention: A picture of attention too.
         aux: What the method made on its way too, and a picture of it where pictures are wanted.
         layers: A folder of pictures of every layer too.
+        weights: A folder of pictures of what every kernel makes too.
     """
 
     folder: Path
@@ -38,6 +40,7 @@ class Wanted:
     attention: bool
     aux: bool = False
     layers: bool = False
+    weights: bool = False
 
     def paths(self, item: Item) -> dict[str, Path]:
         """Return the files of a frame by what they show; those of pictures only where they are wanted."""
@@ -52,6 +55,8 @@ class Wanted:
             suffixes["sheet"] = "_aux.png"
         if self.layers:
             suffixes["layers"] = "_layers"
+        if self.weights:
+            suffixes["weights"] = "_weights"
         return {kind: self.folder / f"{item.name}{suffix}" for kind, suffix in suffixes.items()}
 
 
@@ -74,11 +79,21 @@ def write(result: Result, paths: Mapping[str, Path]) -> None:
     if "aux" in paths:
         write_aux(paths["aux"], result)
     if "layers" in paths:
-        paths["layers"].mkdir(exist_ok=True)
-        for name, image in layer_pictures(result).items():
-            with replacing(paths["layers"] / f"{name}.png") as temporary:
-                image.save(temporary)
+        _write_folder(paths["layers"], layer_pictures(result))
+    if "weights" in paths:
+        _write_folder(paths["weights"], weight_pictures(result))
     write_frame(result.frame, exr)
+
+
+def _write_folder(folder: Path, pictures: Mapping[str, Picture]) -> None:
+    """Write pictures into a folder of their own, in which those of an earlier run are not left."""
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob("*.png"):
+        if old.stem not in pictures:
+            old.unlink()
+    for name, image in pictures.items():
+        with replacing(folder / f"{name}.png") as temporary:
+            image.save(temporary)
 
 
 def write_aux(path: Path, result: Result) -> None:
@@ -108,6 +123,7 @@ def _letters(name: str, image: Image) -> str:
 def _pictures(result: Result, sheet: bool) -> dict[str, Picture]:
     from trainer.reports.attention import attention_picture
     from trainer.reports.composite import is_layered
+    from trainer.reports.fusion import is_fused
     from trainer.reports.layers import layer_sheet
     from trainer.reports.pictures import comparison, tone_map
 
@@ -123,6 +139,8 @@ def _pictures(result: Result, sheet: bool) -> dict[str, Picture]:
     if sheet:
         if is_layered(result.aux):
             pictures["sheet"] = layer_pictures(result)["layers"]
+        elif is_fused(result.aux):
+            pictures["sheet"] = weight_pictures(result)[SHEET]
         else:
             pictures["sheet"] = layer_sheet(color, exposure, result.aux, label)
     return pictures

@@ -9,7 +9,10 @@ import pytest
 import yaml
 
 from trainer import configs
+from trainer.ablation.plan import find_ablation, read_ablation
+from trainer.ablation.variants import trainings_of
 
+ABLATIONS = sorted(path.name for path in (configs.folder() / configs.ABLATIONS).glob("*.yaml"))
 SMOKE = "smoke.yaml"
 OVERLAYS = {f"{name}_sample.yaml": f"{name}_tungsten.yaml" for name in ("acfm", "afgsa", "kpcn")}
 OVERLAYS |= {
@@ -74,16 +77,22 @@ def arguments(name):
 TRAINED = [name for name in configs.names() if name != SMOKE]
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Exit code of each configuration, all trained by one process, the folder, and what it printed."""
-    folder = tmp_path_factory.mktemp("configs")
+def train(folder, commands):
+    """Exit code of each training, all by one process, and what it printed."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MLFLOW_", "PENUMBRA_"))}
     environment |= {"OMP_NUM_THREADS": "2", "PENUMBRA_CACHE": str(folder / "cache")}
-    command = [sys.executable, "-c", RUN, json.dumps({name: arguments(name) for name in TRAINED})]
+    command = [sys.executable, "-c", RUN, json.dumps(commands)]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1]), folder, done.stderr
+    return json.loads(done.stdout.splitlines()[-1]), done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Exit code of each configuration, the folder, and what was printed."""
+    folder = tmp_path_factory.mktemp("configs")
+    codes, printed = train(folder, {name: arguments(name) for name in TRAINED})
+    return codes, folder, printed
 
 
 def test_defaults_and_overlays_are_there():
@@ -115,3 +124,24 @@ def test_an_overlay_keeps_method_and_data_of_what_it_is_laid_over(overlay, base)
     assert networks[0] == networks[1]
     assert under["data"]["init_args"]["root"] in ("sample:bmfr", "sample:stills", "sample:layers")
     assert "root" not in over.get("data", {}).get("init_args", {})
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_every_variant_of_an_ablation_is_a_configuration_of_its_own(name):
+    ablation = read_ablation(find_ablation(f"{configs.ABLATIONS}/{name}"))
+    trainings = trainings_of(ablation, ())
+    assert [training.variant for training in trainings] == list(ablation.variants)
+    assert {training.data for training in trainings} == {"sample:bmfr"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_every_variant_of_an_ablation_trains_for_one_step(name, tmp_path):
+    ablation = read_ablation(find_ablation(f"{configs.ABLATIONS}/{name}"))
+    options = {"batch_size": 1, "workers": 0, "train_patches": 80}
+    words = [f"--data.init_args.{key}={value}" for key, value in options.items()]
+    trainings = trainings_of(ablation, ["--config", SMOKE, "--trainer.limit_train_batches=1", *words])
+    commands = {training.variant.name: ["fit", *training.command({"a": "b"})] for training in trainings}
+    codes, printed = train(tmp_path, commands)
+    assert set(codes.values()) == {0}, printed
+    assert len(list((tmp_path / "runs" / ablation.name).glob("*/checkpoints/best.ckpt"))) == len(trainings)

@@ -28,6 +28,7 @@ def test_wheel_holds_packages_configurations_and_the_sample_only(wheel):
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"data", "models", "trainer"}
     assert "trainer/configs/wskp_bmfr.yaml" in names
     assert "trainer/configs/defaults.yaml" in names
+    assert {f"trainer/configs/ablations/wskp_{name}.yaml" for name in ("branches", "kernels")} <= set(names)
     assert "data/sample/bmfr/manifest.json" in names
     assert sum(name.endswith(".exr") for name in names) >= 3 * 6
     assert {f"data/sample/{name}/manifest.json" for name in ("stills", "layers")} <= set(names)

@@ -118,7 +118,7 @@ def test_cores_read_no_more_pixels_than_square_ones_do() -> None:
 
 
 def test_an_image_that_fits_is_one_tile() -> None:
-    assert core_size(WSKP(), (720, 1280), 720 * 1280 * WSKP.bytes_per_pixel) == (720, 1280)
+    assert core_size(WSKP(), (720, 1280), 720 * 1280 * WSKP().bytes_per_pixel) == (720, 1280)
 
 
 def test_a_budget_too_small_for_one_tile_says_how_much_is_needed() -> None:

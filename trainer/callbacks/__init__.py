@@ -6,6 +6,7 @@ from trainer.callbacks.finite import FiniteGuard
 from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.pictures import ValidationPictures
 from trainer.callbacks.progress import TrainingProgress
+from trainer.callbacks.tags import RunTags
 
 __all__ = [
     "AtomicCheckpointIO",
@@ -14,6 +15,7 @@ __all__ = [
     "FiniteGuard",
     "LastCheckpoint",
     "MirrorRun",
+    "RunTags",
     "TrainingProgress",
     "ValidationPictures",
 ]

@@ -59,13 +59,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--aux",
         action="store_true",
         help="also write what the method made on its way (NFOR: estimated errors, selection map, filtered "
-        "features; Layer, Optimized: layers) to NAME_aux.exr, and with --png a picture of it",
+        "features; Layer, Optimized: layers; WSKP: those of --weights) to NAME_aux.exr, and with --png a "
+        "picture of it",
     )
     parser.add_argument(
         "--layers",
         action="store_true",
         help="also write NAME_layers, a folder of pictures: every layer before and after filtering, its "
         "opacity, the composite, and all on one sheet (Layer, Optimized)",
+    )
+    parser.add_argument(
+        "--weights",
+        action="store_true",
+        help="also write NAME_weights, a folder of pictures as in figure 8 of WSKP's paper: for every kernel "
+        "size the image that it makes alone, its fusion weight (black 0 to pale yellow 1) and its "
+        "log-importance (black and white are the values in the file's name), and all on one sheet, "
+        "kernels.png (WSKP, MultiResolutionWSKP)",
     )
     parser.add_argument(
         "--attention",
@@ -122,11 +131,12 @@ def run(args: argparse.Namespace) -> int:
     from trainer.results import Wanted, write
     from trainer.samples import fill, return_layers
     from trainer.sequences import denoiser_of
+    from trainer.weights import return_weights
 
     check_device(args.device)
     clips = find_clips(args.paths, args.split)
     items = [item for clip in clips for item in clip.items]
-    wanted = Wanted(args.output, args.png, args.attention is not None, args.aux, args.layers)
+    wanted = Wanted(args.output, args.png, args.attention is not None, args.aux, args.layers, args.weights)
     outputs = [path for item in items for path in wanted.paths(item).values()]
     _refuse_inputs(items, outputs)
     refuse_existing(outputs, args.force)
@@ -139,6 +149,8 @@ def run(args: argparse.Namespace) -> int:
     fill(loaded.model, args.fill)
     if args.layers:
         return_layers(loaded)
+    if args.weights:
+        return_weights(loaded)
     kernels = Kernels(loaded.model, args.device)
     with FrameProgress(len(items), kernels.hint) as progress, kernels.announced(progress.say):
         for clip in clips:

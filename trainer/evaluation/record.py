@@ -97,6 +97,7 @@ def write_record(
                 "options": o.facts.get("options", {}),
                 "sha256": o.facts.get("sha256"),
                 "parameters": o.facts.get("parameters"),
+                "deployed": o.facts.get("deployed"),
                 "status": o.status,
                 "reason": o.told(),
                 "cost": costs.get(o.method.label),

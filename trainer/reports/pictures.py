@@ -189,13 +189,14 @@ def _score(name: str, image: Array, reference: Array, exposure: float) -> str:
     return f"{text}   SSIM {float(ssim_wskp(output, target)):.3f}"
 
 
-def legend(size: tuple[int, int], top: float, lines: tuple[str, ...]) -> Image.Image:
+def legend(size: tuple[int, int], top: float, lines: tuple[str, ...], more: bool = True) -> Image.Image:
     """Return the colour bar of `false_color`, upright, as large as a panel.
 
     Args:
         size: Width and height.
         top: The value of the brightest colour.
         lines: What the values are, beside the bar where there is room.
+        more: There may be larger values than `top`, which are drawn as it is.
     """
     width, height = size
     picture = Image.new("RGB", size, _BACKGROUND)
@@ -205,7 +206,7 @@ def legend(size: tuple[int, int], top: float, lines: tuple[str, ...]) -> Image.I
     picture.paste(Image.fromarray(np.repeat(bar[:, None], 22, axis=1)), (2, margin))
     for fraction in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
         y = margin + (1 - fraction) * (height - 2 * margin - 1)
-        label = _number(fraction * top, top) + (" and more" if fraction == 1 else "")
+        label = _number(fraction * top, top) + (" and more" if more and fraction == 1 else "")
         draw.line([(24, y), (29, y)], _FAINT)
         draw.text((34, y), label, _FAINT, font(14), anchor="lm")
     if width >= 240:
