@@ -2,6 +2,7 @@
 
 title: Branches in training
 config: wskp_bmfr.yaml                  # of variants that name none; a list is laid over each other
+options: {trainer.max_steps: 600}       # of all variants
 metrics: [psnr_wskp, ssim_wskp]         # of tables; the first is drawn
 layouts:
   table5: {kind: pairs, title: As table 5}
@@ -129,9 +130,10 @@ def read_ablation(path: Path) -> Ablation:
         raise UsageError(
             f"{path} describes no ablation: expected a list of `variants`; see trainer ablate -h"
         )
-    _only(str(path), tree, ("title", "config", "metrics", "layouts", "variants"))
+    _only(str(path), tree, ("title", "config", "options", "metrics", "layouts", "variants"))
     layouts = _layouts(path, tree.get("layouts") or {})
-    variants = tuple(_variant(path, tree.get("config"), entry, layouts) for entry in tree["variants"])
+    common = _options(str(path), tree)
+    variants = tuple(_variant(path, tree.get("config"), common, entry, layouts) for entry in tree["variants"])
     names = [variant.name for variant in variants]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UsageError(f"{path}: two variants are called {twice[0]!r}")
@@ -164,7 +166,16 @@ def _layouts(path: Path, tree: Any) -> dict[str, Layout]:
     return found
 
 
-def _variant(path: Path, config: Any, entry: Any, layouts: Mapping[str, Layout]) -> Variant:
+def _options(place: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    options = entry.get("options") or {}
+    if not isinstance(options, dict):
+        raise UsageError(f"{place}, options: expected lines such as `model.net.branches: false`")
+    return {str(key): value for key, value in options.items()}
+
+
+def _variant(
+    path: Path, config: Any, common: Mapping[str, Any], entry: Any, layouts: Mapping[str, Layout]
+) -> Variant:
     name = entry.get("name") if isinstance(entry, dict) else None
     place = f"{path}, variant {name}"
     _only(place, entry, ("name", "config", "options", "places"))
@@ -177,13 +188,11 @@ def _variant(path: Path, config: Any, entry: Any, layouts: Mapping[str, Layout])
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
         raise UsageError(f"{place}: expected `config: FILE.yaml`, here or for all variants")
-    options = entry.get("options") or {}
-    if not isinstance(options, dict):
-        raise UsageError(f"{place}, options: expected lines such as `model.net.branches: false`")
+    options = {**common, **_options(place, entry)}
     places = entry.get("places") or {}
     _only(f"{place}, places", places, tuple(layouts))
     taken = {key: _place(f"{place}, places, {key}", layouts[key], value) for key, value in places.items()}
-    return Variant(name, tuple(files), {str(key): value for key, value in options.items()}, taken)
+    return Variant(name, tuple(files), options, taken)
 
 
 def _place(place: str, layout: Layout, value: Any) -> Place:
