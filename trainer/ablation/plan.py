@@ -66,12 +66,14 @@ class Variant:
         name: In tables.
         configs: Configurations that are laid over each other.
         options: Key of the configuration → value.
+        common: The same of all variants; options of the command line count more.
         places: Name of a layout → row and column, or number.
     """
 
     name: str
     configs: tuple[str, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
+    common: Mapping[str, Any] = field(default_factory=dict)
     places: Mapping[str, Place] = field(default_factory=dict)
 
 
@@ -188,11 +190,11 @@ def _variant(
     files = [files] if isinstance(files, str) else files
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
         raise UsageError(f"{place}: expected `config: FILE.yaml`, here or for all variants")
-    options = {**common, **_options(place, entry)}
+    options = _options(place, entry)
     places = entry.get("places") or {}
     _only(f"{place}, places", places, tuple(layouts))
     taken = {key: _place(f"{place}, places, {key}", layouts[key], value) for key, value in places.items()}
-    return Variant(name, tuple(files), options, taken)
+    return Variant(name, tuple(files), options, common, taken)
 
 
 def _place(place: str, layout: Layout, value: Any) -> Place:

@@ -95,7 +95,8 @@ def _training(variant: Variant, experiment: str, rest: Sequence[str]) -> Trainin
     own = f"--trainer.logger.init_args.experiment={experiment}"
     # Command lines of `trainer fit` are read from left to right.
     given = configs.resolve_arguments(list(rest))
-    arguments = [*files, own, *given, *options(dict(variant.options))]
+    common = options(dict(variant.common))
+    arguments = [*files, own, *common, *given, *options(dict(variant.options))]
     config = parsed(arguments).as_dict()
     if config.get("ckpt_path") or any(word.startswith("--ckpt_path") for word in rest):
         raise UsageError("--ckpt_path: variants are trained from their beginning; leave the option out")

@@ -42,11 +42,12 @@ def test_ablations_are_found_by_path_and_by_name_and_are_no_configurations(tmp_p
     assert not [name for name in configs.names() if name.startswith(configs.ABLATIONS)]
 
 
-def test_options_of_all_variants_give_way_to_those_of_one(tmp_path: Path) -> None:
-    text = "config: a.yaml\noptions: {x: 1, y: 2}\nvariants:\n- {name: one}\n- {name: two, options: {y: 3, z: 4}}\n"
-    (tmp_path / "a.yaml").write_text(text)
+def test_options_of_all_variants_are_read(tmp_path: Path) -> None:
+    variants = "variants:\n- {name: one}\n- {name: two, options: {y: 3}}\n"
+    (tmp_path / "a.yaml").write_text("config: a.yaml\noptions: {x: 1, y: 2}\n" + variants)
     one, two = read_ablation(tmp_path / "a.yaml").variants
-    assert (one.options, two.options) == ({"x": 1, "y": 2}, {"x": 1, "y": 3, "z": 4})
+    assert one.common == two.common == {"x": 1, "y": 2}
+    assert (one.options, two.options) == ({}, {"y": 3})
 
 
 def test_the_networks_for_interactive_rates_are_those_of_the_paper_at_equal_steps() -> None:
@@ -54,7 +55,7 @@ def test_the_networks_for_interactive_rates_are_those_of_the_paper_at_equal_step
     names = [variant.name for variant in ablation.variants]
     assert len(names) == 11
     assert {"WSKP 6 layers", "WSKP 3 layers", "KP", "MR-KP", "NBGD 2 layers", "RAE"} < set(names)
-    assert len({variant.options["trainer.max_steps"] for variant in ablation.variants}) == 1
+    assert len({variant.common["trainer.max_steps"] for variant in ablation.variants}) == 1
 
 
 def test_the_ablation_of_kernels_has_the_kernels_of_figures_9_and_10() -> None:

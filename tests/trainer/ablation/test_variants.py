@@ -40,6 +40,14 @@ def test_a_variant_has_the_options_of_all_and_its_own_count_more(pair: list[Trai
     assert list(nets[1].kernel_sizes) == [3, 5]
 
 
+def test_the_command_line_counts_more_than_common_options_and_less_than_own_ones() -> None:
+    common = {"trainer.max_epochs": 7, "model.net.width": 5, "trainer.max_steps": 11}
+    made = Variant("one", WSKP, {"model.net.width": 4}, common)
+    config = config_of(trainings_of(ablation(made), REST)[0])
+    assert (config.trainer.max_epochs, config.trainer.max_steps) == (2, 11)
+    assert config.model.init_args.net.init_args.width == 4
+
+
 def test_a_variant_registers_no_model_and_its_run_is_tagged(pair: list[Training]) -> None:
     callbacks = config_of(pair[0], **{"mlflow.parentRunId": "abc"}).trainer.callbacks
     names = [callback.class_path.rpartition(".")[2] for callback in callbacks]
