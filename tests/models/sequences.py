@@ -6,6 +6,8 @@ that the board moves farther than the wall, uncovers it, and both leave the imag
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -68,3 +70,25 @@ def image(tensor: Tensor) -> Array:
 def joined(*batches: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return several batches as one."""
     return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
+
+
+def damages() -> dict[str, Callable[[dict[str, Tensor]], dict[str, Tensor]]]:
+    """Return what makes frames of renderers that failed: name → function of a batch."""
+
+    def light(change: Callable[[Tensor], Tensor]) -> Callable[[dict[str, Tensor]], dict[str, Tensor]]:
+        return lambda batch: {**batch, "irradiance": change(batch["irradiance"])}
+
+    def everything(value: float) -> Callable[[dict[str, Tensor]], dict[str, Tensor]]:
+        return lambda batch: {name: torch.full_like(plane, value) for name, plane in batch.items()}
+
+    return {
+        "some not a number": light(lambda x: torch.where(x > 1, torch.nan, x)),
+        "infinite": light(lambda x: torch.full_like(x, torch.inf)),
+        "fireflies": light(lambda x: torch.where(x > 2, 65504.0, x)),
+        "largest": light(lambda x: torch.full_like(x, 3e38)),
+        "negative": light(lambda x: -x),
+        "black, nothing hit": everything(0.0),
+        "all not a number": everything(torch.nan),
+        "all infinite": everything(torch.inf),
+        "all largest": everything(3e38),
+    }

@@ -13,11 +13,11 @@ from models.classical.svgf import SVGF
 from models.denoiser import Denoised
 from tests.models.frames import largest_relative
 from tests.models.plain_svgf import Options, svgf
-from tests.models.sequences import image, joined, tensors, walk
+from tests.models.sequences import damages, image, joined, tensors, walk
 
 pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 Buffers = dict[str, Tensor]
 
 
@@ -261,22 +261,11 @@ def test_images_of_a_pixel_s_width_are_filtered(size: tuple[int, int]) -> None:
         assert result.color.isfinite().all()
 
 
-DAMAGE = {
-    "NaN": lambda b: {**b, "irradiance": b["irradiance"] * torch.where(b["depth"] > 8.5, NAN, 1.0)},
-    "infinite": lambda b: {**b, "irradiance": torch.full_like(b["irradiance"], INF)},
-    "fireflies": lambda b: {**b, "irradiance": torch.where(b["irradiance"] > 2, 65504.0, b["irradiance"])},
-    "largest": lambda b: {**b, "irradiance": torch.full_like(b["irradiance"], 3e38)},
-    "negative": lambda b: {**b, "irradiance": -b["irradiance"]},
-    "black": lambda b: {name: torch.zeros_like(plane) for name, plane in b.items()},
-    "all NaN": lambda b: {name: torch.full_like(plane, NAN) for name, plane in b.items()},
-}
-
-
 @pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", damages())
 def test_a_damaged_frame_stays_finite_and_so_do_those_after_it(damage: str, kind: torch.dtype) -> None:
     good = sequence(4, kind=torch.float32)
-    frames = [good[0], DAMAGE[damage](good[1]), good[2], good[3]]
+    frames = [good[0], damages()[damage](good[1]), good[2], good[3]]
     network = SVGF(geometry="position")
     with torch.autocast("cpu", torch.bfloat16, enabled=kind == torch.bfloat16):
         results = run(network, [{name: plane.to(kind) for name, plane in b.items()} for b in frames])
