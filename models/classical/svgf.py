@@ -115,7 +115,7 @@ class SVGF(SequenceFilter):
     """
 
     inputs: tuple[str, ...] = ("irradiance", "albedo", "normal", "depth", "motion")
-    bytes_per_pixel = 600
+    bytes_per_pixel = 700
 
     def __init__(
         self,

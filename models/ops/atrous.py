@@ -10,7 +10,8 @@ from p to q: the steeper of both slopes times their distance, as in released cod
 in their direction times it, as in the paper (`along`). r says how different luminances may be. The pixel's
 own weight is k(0); pixels outside the image and those that hit nothing take no part.
 
-Works on whole images, one tap after the other, so that no array grows with the number of taps.
+Works on images, one tap after the other, so that no array grows with the number of taps; on a CPU some rows
+at a time.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from models.ops.boxes import exporting
 from models.ops.slopes import slopes
 
 Slope = Literal["steepest", "along"]
@@ -33,6 +35,9 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 _FLATTEST = 1e-8
 """Least change of depth that counts, in scene units: keeps flat surfaces from dividing by 0."""
+
+_PIXELS = 1 << 15
+"""Pixels done at a time on a CPU."""
 
 _EDGE = (1.0, 2 / 3, 1 / 6)
 """A-trous kernel along one axis at distance 0, 1 and 2, proportional to 3/8, 1/4, 1/16."""
@@ -85,33 +90,37 @@ class Surfaces:
     """
 
     def __init__(self, normal: Tensor, depth: Tensor, reach: int, stops: EdgeStops) -> None:
-        self.reach, self.stops, self.size = reach, stops, tuple(depth.shape[-2:])
-        self.hit = (depth > 0).to(depth.dtype)
-        self.normal, self.depth = normal, depth
-        self._right, self._down = slopes(depth)
-        self._steepest = torch.maximum(self._right.abs(), self._down.abs())
-        self._around = F.pad(torch.cat([normal, depth, self.hit], 1), [reach] * 4)
+        self.reach, self.stops = reach, stops
+        self.height, self.width = depth.shape[-2:]
+        # Where nothing was hit, and outside, a normal of 0 keeps pixels apart from all others.
+        self._own = torch.cat([normal * (depth > 0), depth, *slopes(depth)], 1)
+        self._around = self.padded(self._own[:, :4])
 
     def padded(self, image: Tensor) -> Tensor:
         """Return an image with room around it, for `near`."""
         return F.pad(image, [self.reach] * 4)
 
-    def near(self, padded: Tensor, tap: Tap) -> Tensor:
-        """Return what neighbours hold in an image with room around it."""
+    def near(self, padded: Tensor, tap: Tap, rows: slice) -> Tensor:
+        """Return what neighbours of some rows hold, in an image with room around it."""
         top, left = self.reach + tap.down, self.reach + tap.right
-        return padded[..., top : top + self.size[0], left : left + self.size[1]]
+        return padded[..., top + rows.start : top + rows.stop, left : left + self.width]
 
-    def weights(self, tap: Tap) -> tuple[Tensor, Tensor]:
-        """Return what of a tap's weight stands before the exponential, and the depth's part in it."""
-        around = self.near(self._around, tap)
-        normal, depth, hit = around[:, :3], around[:, 3:4], around[:, 4:]
-        alike = (self.normal * normal).sum(1, keepdim=True).clamp(0.0, 1.0).pow(self.stops.normal)
+    def weights(self, tap: Tap, rows: slice) -> tuple[Tensor, Tensor]:
+        """Return what of a tap's weight stands before the exponential, and the depth's part in it.
+
+        Args:
+            tap: The neighbour.
+            rows: Which of the pixels.
+        """
+        own, around = self._own[..., rows, :], self.near(self._around, tap, rows)
+        alike = (own[:, :3] * around[:, :3]).sum(1, keepdim=True).clamp(0.0, 1.0).pow(self.stops.normal)
+        right, down = own[:, 4:5], own[:, 5:]
         if self.stops.slope == "steepest":
-            change = self._steepest * (tap.down**2 + tap.right**2) ** 0.5
+            change = torch.maximum(right.abs(), down.abs()) * (tap.down**2 + tap.right**2) ** 0.5
         else:
-            change = (self._right * tap.right + self._down * tap.down).abs()
-        apart = (self.depth - depth).abs() / (self.stops.depth * change.clamp_min(_FLATTEST))
-        return tap.kernel * alike * hit * self.hit, apart
+            change = (right * tap.right + down * tap.down).abs()
+        apart = (own[:, 3:4] - around[:, 3:]).abs() / (self.stops.depth * change.clamp_min(_FLATTEST))
+        return tap.kernel * alike, apart
 
 
 class Means(NamedTuple):
@@ -139,21 +148,39 @@ def edge_stopping_means(
         taps: The neighbours, with the pixel itself.
     """
     light = luminance(values[:, :3])
-    count = values.shape[1]
-    around = surfaces.padded(torch.cat([values, variances, light], 1))
-    total, squares = torch.zeros_like(values), torch.zeros_like(variances)
+    around = surfaces.padded(torch.cat([light, values, variances], 1))
+    spread = spread.expand_as(light)
+    parts = [_means_of_rows(around, values.shape[1], spread, surfaces, taps, rows) for rows in _strips(light)]
+    return Means(*(torch.cat(part, -2) for part in zip(*parts, strict=True)))
+
+
+def _means_of_rows(
+    around: Tensor, count: int, spread: Tensor, surfaces: Surfaces, taps: Sequence[Tap], rows: slice
+) -> Means:
+    """Return the means of some rows; `around` holds luminance, `count` values, and variances."""
+    own = surfaces.near(around, Tap(0, 0, 1.0), rows)
+    light, different = own[:, :1], spread[..., rows, :]
+    values, variances = slice(1, 1 + count), slice(1 + count, None)
+    total, squares = torch.zeros_like(own[:, values]), torch.zeros_like(own[:, variances])
     norm = torch.zeros_like(light)
     for tap in taps:
-        near = surfaces.near(around, tap)
+        near = surfaces.near(around, tap, rows)
         if tap.down == tap.right == 0:
             weight = torch.full_like(light, tap.kernel)
         else:
-            front, apart = surfaces.weights(tap)
-            weight = front * torch.exp(-apart - (light - near[:, -1:]).abs() / spread)
-        total = total + weight * near[:, :count]
-        squares = squares + weight.square() * near[:, count:-1]
+            front, apart = surfaces.weights(tap, rows)
+            weight = front * torch.exp(-apart - (light - near[:, :1]).abs() / different)
+        total = torch.addcmul(total, weight, near[:, values])
+        squares = torch.addcmul(squares, weight.square(), near[:, variances])
         norm = norm + weight
     return Means(total / norm, squares / norm.square())
+
+
+def _strips(image: Tensor) -> list[slice]:
+    """Return rows that are done together: a processor's cache holds what becomes of them."""
+    height, width = image.shape[-2:]
+    step = max(1, _PIXELS // width) if image.device.type == "cpu" and not exporting() else height
+    return [slice(top, min(top + step, height)) for top in range(0, height, step)]
 
 
 def luminance(color: Tensor) -> Tensor:

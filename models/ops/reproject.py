@@ -68,9 +68,10 @@ class Neighbours:
     def mean(self, planes: Tensor) -> Tensor:
         """Return the weighted mean of planes (B, C, H, W) over the neighbours, 0 where there are none."""
         total = self.total
-        count = self.index.shape[1]
-        weighted = torch.stack([self.share[:, k : k + 1] * self.of(planes, k) for k in range(count)]).sum(0)
-        return weighted / torch.where(total > 0, total, 1.0)
+        sums = torch.zeros_like(planes)
+        for k in range(self.index.shape[1]):
+            sums = torch.addcmul(sums, self.share[:, k : k + 1], self.of(planes, k))
+        return sums / torch.where(total > 0, total, 1.0)
 
 
 def bilinear(motion: Tensor) -> Neighbours:

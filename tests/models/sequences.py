@@ -13,7 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.classical.sequence_filter import SequenceFilter
+from models.denoiser import Denoised
+
 Array = NDArray[np.float64]
+Buffers = dict[str, Tensor]
 
 FOCAL = 10.0
 SKY_ROWS = 2
@@ -56,7 +60,29 @@ def walk(count: int, height: int = 10, width: int = 12, step: float = 1.6) -> li
     return [frame(i * step, (i - 1) * step, height, width, i) for i in range(count)]
 
 
-def tensors(buffers: dict[str, Array], dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+def sequence(
+    count: int = 3, height: int = 16, width: int = 18, kind: torch.dtype = torch.float64
+) -> list[Buffers]:
+    """Return the frames of `walk` as batches of one."""
+    return [tensors(buffers, kind) for buffers in walk(count, height, width)]
+
+
+def at_rest(count: int, height: int = 16, width: int = 18) -> list[Buffers]:
+    """Return frames of a camera that stands still: only the noise differs."""
+    first, *others = sequence(count, height, width)
+    held = {**first, "motion": torch.zeros_like(first["motion"])}
+    return [held, *({**held, "irradiance": other["irradiance"]} for other in others)]
+
+
+def run(network: SequenceFilter, frames: list[Buffers]) -> list[Denoised]:
+    """Denoise frames one after the other, each with the state of the one before."""
+    results: list[Denoised] = []
+    for buffers in frames:
+        results.append(network(buffers, results[-1].state if results else None))
+    return results
+
+
+def tensors(buffers: dict[str, Array], dtype: torch.dtype = torch.float64) -> Buffers:
     """Return buffers as a batch of one, (1, C, H, W)."""
     return {name: torch.from_numpy(image).permute(2, 0, 1)[None].to(dtype) for name, image in buffers.items()}
 
@@ -67,18 +93,18 @@ def image(tensor: Tensor) -> Array:
     return array
 
 
-def joined(*batches: dict[str, Tensor]) -> dict[str, Tensor]:
+def joined(*batches: Buffers) -> Buffers:
     """Return several batches as one."""
     return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def damages() -> dict[str, Callable[[dict[str, Tensor]], dict[str, Tensor]]]:
+def damages() -> dict[str, Callable[[Buffers], Buffers]]:
     """Return what makes frames of renderers that failed: name → function of a batch."""
 
-    def light(change: Callable[[Tensor], Tensor]) -> Callable[[dict[str, Tensor]], dict[str, Tensor]]:
+    def light(change: Callable[[Tensor], Tensor]) -> Callable[[Buffers], Buffers]:
         return lambda batch: {**batch, "irradiance": change(batch["irradiance"])}
 
-    def everything(value: float) -> Callable[[dict[str, Tensor]], dict[str, Tensor]]:
+    def everything(value: float) -> Callable[[Buffers], Buffers]:
         return lambda batch: {name: torch.full_like(plane, value) for name, plane in batch.items()}
 
     return {

@@ -7,44 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from data.frame import Frame
 from data.temporal import accumulate
 from models.classical.bmfr import BMFR
-from models.denoiser import Denoised
 from tests.models.frames import largest_relative
 from tests.models.plain_bmfr import Options, bmfr
-from tests.models.sequences import damages, image, joined, tensors, walk
+from tests.models.sequences import at_rest, image, run, sequence, tensors, walk
 
 pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 NAN = float("nan")
 LIMIT = 0.5
 """Squared position limit that tells the board of the sequence from the wall."""
-
-Buffers = dict[str, Tensor]
-
-
-def run(network: BMFR, frames: list[Buffers]) -> list[Denoised]:
-    results, state = [], None
-    for buffers in frames:
-        results.append(network(buffers, state))
-        state = results[-1].state
-    return results
-
-
-def sequence(
-    count: int = 3, height: int = 16, width: int = 18, kind: torch.dtype = torch.float64
-) -> list[Buffers]:
-    return [tensors(buffers, kind) for buffers in walk(count, height, width)]
-
-
-def at_rest(count: int, height: int = 16, width: int = 18) -> list[Buffers]:
-    """A camera that stands still: only the noise differs."""
-    first, *others = sequence(count, height, width)
-    held = {**first, "motion": torch.zeros_like(first["motion"])}
-    return [held, *({**held, "irradiance": other["irradiance"]} for other in others)]
 
 
 OPTIONS: list[tuple[dict[str, Any], dict[str, Any]]] = [
@@ -126,36 +101,6 @@ def test_constant_irradiance_stays_constant_on_every_frame() -> None:
         torch.testing.assert_close(result.color, 0.7 * buffers["albedo"], rtol=1e-9, atol=0)
 
 
-def test_noise_goes_down_within_a_frame_and_from_frame_to_frame() -> None:
-    frames = at_rest(12, 24, 28)
-    clean = torch.stack([f["irradiance"] for f in at_rest(300, 24, 28)]).mean(0) * frames[0]["albedo"]
-    errors = [(r.color - clean).square().mean().item() for r in run(BMFR(), frames)]
-    noisy = (frames[0]["irradiance"] * frames[0]["albedo"] - clean).square().mean().item()
-    assert errors[0] < 0.3 * noisy
-    assert errors[-1] < 0.5 * errors[0]
-
-
-def test_a_state_is_detached_and_needs_nothing_else() -> None:
-    frames = sequence(2)
-    with torch.enable_grad():
-        frames[0]["irradiance"].requires_grad_()
-        first = BMFR()(frames[0])
-        assert first.color.requires_grad
-        assert not any(plane.requires_grad for plane in first.state.values())
-    moved = {name: plane.clone() for name, plane in first.state.items()}
-    network = BMFR()
-    assert torch.equal(network(frames[1], moved).color, network(frames[1], first.state).color)
-
-
-def test_a_frame_of_another_size_or_batch_starts_anew() -> None:
-    small, large = sequence(1, 8, 9)[0], sequence(1, 9, 8)[0]
-    network = BMFR()
-    state = network(small).state
-    assert torch.equal(network(large, state).color, network(large).color)
-    twice = joined(small, small)
-    assert torch.equal(network(twice, state).color, network(twice).color)
-
-
 def test_a_cut_to_another_place_without_known_motion_brings_no_history() -> None:
     first, second = sequence(2)
     second["position"] = first["position"] + 1000 * (first["depth"] > 0)
@@ -174,17 +119,6 @@ def test_a_camera_that_jumps_shows_the_fit_of_the_new_frame_alone() -> None:
     assert found.aux is not None
     assert torch.equal(found.state["noisy"], second["irradiance"])
     torch.testing.assert_close(found.color, found.aux["irradiance"] * second["albedo"])
-
-
-def test_a_batch_element_never_influences_another() -> None:
-    one, other = sequence(3), sequence(3)
-    for buffers in other:
-        buffers["irradiance"] = 1e6 * buffers["irradiance"].flip(-1)
-        buffers["position"] = 50 * buffers["position"]
-    separate = run(BMFR(), one)
-    together = run(BMFR(), [joined(*pair) for pair in zip(one, other, strict=True)])
-    for apart, both in zip(separate, together, strict=True):
-        torch.testing.assert_close(both.color[:1], apart.color, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("cut", [False, True])
@@ -213,53 +147,6 @@ def test_with_all_ranges_scaled_positions_in_other_units_change_nothing() -> Non
         torch.testing.assert_close(found.color, truth.color, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2), (33, 65)])
-def test_images_of_any_size_are_filtered(size: tuple[int, int]) -> None:
-    for result in run(BMFR(), sequence(3, *size, kind=torch.float32)):
-        assert result.color.shape == (1, 3, *size)
-        assert result.color.isfinite().all()
-
-
-@pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("damage", damages())
-def test_a_damaged_frame_stays_finite_and_so_do_those_after_it(
-    damage: str, kind: torch.dtype, half: bool
-) -> None:
-    good = sequence(4, kind=torch.float32)
-    frames = [good[0], damages()[damage](good[1]), good[2], good[3]]
-    with torch.autocast("cpu", torch.bfloat16, enabled=kind == torch.bfloat16):
-        results = run(BMFR(half=half), [{name: plane.to(kind) for name, plane in b.items()} for b in frames])
-    for result in results:
-        assert result.color.dtype == torch.float32
-        assert result.color.isfinite().all()
-        assert (result.color >= 0).all()
-        assert all(plane.isfinite().all() for plane in result.state.values())
-
-
-@pytest.mark.parametrize("solver", ["normal", "qr"])
-def test_the_noisy_image_has_a_finite_gradient_in_every_frame(solver: Any) -> None:
-    first, second = sequence(2, kind=torch.float32)
-    network = BMFR(solver=solver)
-    state = network(first).state
-    second["irradiance"][..., 4:8, :] = 0
-    second["irradiance"].requires_grad_()
-    with torch.enable_grad():
-        network(second, state).color.sum().backward()
-    gradient = second["irradiance"].grad
-    assert gradient is not None
-    assert gradient.isfinite().all()
-    assert gradient.abs().max() > 0
-
-
-@pytest.mark.parametrize("name", BMFR.inputs)
-def test_a_missing_buffer_is_named_with_the_command_that_makes_it(name: str) -> None:
-    (frame,) = sequence(1)
-    del frame[name]
-    with pytest.raises(ValueError, match=f"missing: {name};.*`trainer render sequences` writes all"):
-        BMFR()(frame)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -277,9 +164,3 @@ def test_a_missing_buffer_is_named_with_the_command_that_makes_it(name: str) -> 
 def test_options_out_of_range_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"BMFR: {message}"):
         BMFR(**arguments)
-
-
-def test_it_is_recurrent_and_never_tiled() -> None:
-    assert BMFR.recurrent
-    assert BMFR.whole
-    assert not BMFR().temporal  # its input is not accumulated: it does that itself

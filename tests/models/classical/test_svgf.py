@@ -7,43 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from models.classical.svgf import SVGF
-from models.denoiser import Denoised
 from tests.models.frames import largest_relative
 from tests.models.plain_svgf import Options, svgf
-from tests.models.sequences import damages, image, joined, tensors, walk
+from tests.models.sequences import at_rest, image, run, sequence, tensors, walk
 
 pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
 NAN = float("nan")
-Buffers = dict[str, Tensor]
-
-
-def run(network: SVGF, frames: list[Buffers]) -> list[Denoised]:
-    results, state = [], None
-    for buffers in frames:
-        results.append(network(buffers, state))
-        state = results[-1].state
-    return results
-
-
-def sequence(
-    count: int = 3, height: int = 16, width: int = 18, kind: torch.dtype = torch.float64
-) -> list[Buffers]:
-    return [tensors(buffers, kind) for buffers in walk(count, height, width)]
-
-
-def at_rest(count: int, height: int = 16, width: int = 18) -> list[Buffers]:
-    """A camera that stands still: only the noise differs."""
-    first, *others = sequence(count, height, width)
-    held = {**first, "motion": torch.zeros_like(first["motion"])}
-    return [held, *({**held, "irradiance": other["irradiance"]} for other in others)]
-
-
-def alone(network: SVGF, buffers: Buffers) -> Tensor:
-    return network(buffers).color
 
 
 OPTIONS: list[tuple[dict[str, Any], Options]] = [
@@ -150,41 +122,11 @@ def test_the_history_is_the_image_after_the_feedback_iteration() -> None:
         torch.testing.assert_close(state["color"] * frame["albedo"], short.color)
 
 
-def test_noise_goes_down_within_a_frame_and_from_frame_to_frame() -> None:
-    frames = at_rest(10, 24, 28)
-    clean = torch.stack([f["irradiance"] for f in at_rest(300, 24, 28)]).mean(0) * frames[0]["albedo"]
-    errors = [(r.color - clean).square().mean().item() for r in run(SVGF(), frames)]
-    noisy = (frames[0]["irradiance"] * frames[0]["albedo"] - clean).square().mean().item()
-    assert errors[0] < 0.3 * noisy
-    assert errors[-1] < 0.5 * errors[0]
-
-
-def test_a_state_is_detached_and_needs_nothing_else() -> None:
-    frames = sequence(2)
-    with torch.enable_grad():
-        frames[0]["irradiance"].requires_grad_()
-        first = SVGF()(frames[0])
-        assert first.color.requires_grad
-        assert not any(plane.requires_grad for plane in first.state.values())
-    moved = {name: plane.clone() for name, plane in first.state.items()}
-    network = SVGF()
-    assert torch.equal(network(frames[1], moved).color, network(frames[1], first.state).color)
-
-
-def test_a_frame_of_another_size_or_batch_starts_anew() -> None:
-    small, large = sequence(1, 8, 9)[0], sequence(1, 9, 8)[0]
-    network = SVGF()
-    state = network(small).state
-    assert torch.equal(network(large, state).color, alone(network, large))
-    twice = joined(small, small)
-    assert torch.equal(network(twice, state).color, alone(network, twice))
-
-
 def test_a_camera_that_jumps_starts_anew_where_the_motion_leads_out_of_the_image() -> None:
     first, second = sequence(2)
     second["motion"] = torch.full_like(second["motion"], 500.0)
     network = SVGF()
-    assert torch.equal(network(second, network(first).state).color, alone(network, second))
+    assert torch.equal(network(second, network(first).state).color, network(second).color)
 
 
 @pytest.mark.parametrize("geometry", ["depth", "position"])
@@ -210,18 +152,6 @@ def test_positions_know_a_surface_again_that_came_nearer_and_depths_do_not() -> 
         )
     assert found["depth"] < 0.1
     assert found["position"] == 1
-
-
-def test_a_batch_element_never_influences_another() -> None:
-    one, other = sequence(3), sequence(3)
-    for buffers in other:
-        buffers["irradiance"] = 1e6 * buffers["irradiance"].flip(-1)
-        buffers["position"] = 50 * buffers["position"]
-    network = SVGF(geometry="position")
-    separate = run(network, one)
-    together = run(network, [joined(*pair) for pair in zip(one, other, strict=True)])
-    for apart, both in zip(separate, together, strict=True):
-        torch.testing.assert_close(both.color[:1], apart.color, rtol=1e-12, atol=0)
 
 
 def test_radiance_in_other_units_with_its_exposure_comes_back_in_those_units() -> None:
@@ -252,66 +182,6 @@ def test_depths_in_other_units_change_nothing() -> None:
         network = SVGF(geometry=geometry)  # type: ignore[arg-type]
         for found, truth in zip(run(network, scaled), run(network, frames), strict=True):
             torch.testing.assert_close(found.color, truth.color, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2)])
-def test_images_of_a_pixel_s_width_are_filtered(size: tuple[int, int]) -> None:
-    for result in run(SVGF(), sequence(3, *size, kind=torch.float32)):
-        assert result.color.shape == (1, 3, *size)
-        assert result.color.isfinite().all()
-
-
-@pytest.mark.parametrize("kind", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("damage", damages())
-def test_a_damaged_frame_stays_finite_and_so_do_those_after_it(damage: str, kind: torch.dtype) -> None:
-    good = sequence(4, kind=torch.float32)
-    frames = [good[0], damages()[damage](good[1]), good[2], good[3]]
-    network = SVGF(geometry="position")
-    with torch.autocast("cpu", torch.bfloat16, enabled=kind == torch.bfloat16):
-        results = run(network, [{name: plane.to(kind) for name, plane in b.items()} for b in frames])
-    for result in results:
-        assert result.color.dtype == torch.float32
-        assert result.color.isfinite().all()
-        assert (result.color >= 0).all()
-        assert all(plane.isfinite().all() for plane in result.state.values())
-
-
-def test_the_noisy_image_has_a_finite_gradient_in_every_frame() -> None:
-    first, second = sequence(2, kind=torch.float32)
-    network = SVGF()
-    state = network(first).state
-    second["irradiance"][..., 4:8, :] = 0
-    second["irradiance"].requires_grad_()
-    with torch.enable_grad():
-        network(second, state).color.sum().backward()
-    gradient = second["irradiance"].grad
-    assert gradient is not None
-    assert gradient.isfinite().all()
-    assert gradient.abs().max() > 0
-
-
-@pytest.mark.parametrize("name", SVGF.inputs)
-def test_a_missing_buffer_is_named_with_the_command_that_makes_it(name: str) -> None:
-    (frame,) = sequence(1)
-    del frame[name]
-    with pytest.raises(ValueError, match=f"missing: {name};.*`trainer render sequences` writes all"):
-        SVGF()(frame)
-
-
-def test_for_missing_motion_and_depth_the_command_that_derives_them_is_named() -> None:
-    (frame,) = sequence(1)
-    del frame["motion"], frame["depth"]
-    with pytest.raises(
-        ValueError, match="`trainer denoise` derives depth and motion for frames with position"
-    ):
-        SVGF()(frame)
-
-
-def test_a_buffer_of_another_shape_is_named() -> None:
-    (frame,) = sequence(1)
-    frame["motion"] = frame["motion"][:, :1]
-    with pytest.raises(ValueError, match=r"buffer 'motion' has shape .* expected"):
-        SVGF()(frame)
 
 
 def test_without_positions_it_offers_to_compare_depths() -> None:
@@ -345,9 +215,3 @@ def test_without_positions_it_offers_to_compare_depths() -> None:
 def test_options_out_of_range_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"SVGF: {message}"):
         SVGF(**arguments)
-
-
-def test_it_is_recurrent_and_never_tiled() -> None:
-    assert SVGF.recurrent
-    assert SVGF.whole
-    assert not SVGF().temporal  # its input is not accumulated: it does that itself
