@@ -7,7 +7,8 @@ frames are never cut into tiles.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from torch import Tensor
 
@@ -105,20 +106,24 @@ def carried(**planes: Tensor) -> State:
     return {name: plane.detach() for name, plane in planes.items()}
 
 
-def checked(method: str, *, positive: Mapping[str, float], shares: Mapping[str, float]) -> None:
+def checked(
+    method: str, given: Mapping[str, Any], *, positive: Collection[str], shares: Collection[str]
+) -> None:
     """Refuse numbers outside their range.
 
     Args:
         method: Whose options they are.
-        positive: Options that must be above 0.
-        shares: Options that must be above 0 and at most 1.
+        given: The options; None passes.
+        positive: Names of those that must be above 0.
+        shares: Names of those that must be above 0 and at most 1.
 
     Raises:
         ValueError: Names the method, the option and its range.
     """
-    for name, value in positive.items():
-        if not value > 0:
-            raise ValueError(f"{method}: {name} must be positive, got {value}")
-    for name, value in shares.items():
-        if not 0 < value <= 1:
+    for name in (*positive, *shares):
+        value = given[name]
+        if value is not None and not value > 0:
+            most = " and at most 1" if name in shares else ""
+            raise ValueError(f"{method}: {name} must be above 0{most}, got {value}")
+        if name in shares and value > 1:
             raise ValueError(f"{method}: {name} must be above 0 and at most 1, got {value}")

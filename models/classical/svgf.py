@@ -21,16 +21,18 @@ Where the released pass (in the Falcor framework) and the paper differ:
     neighbour                                                        times distance (paper)
     border of the image        takes part (paper says nothing)       margin=1: accumulates nothing (pass)
 
-The paper also compares mesh numbers, which frames do not have. It filters direct and indirect light by
-themselves; `irradiance` is their sum and filtered once. Slopes are those of `models.ops.slopes`, not of 2x2
-pixels, and count of frames comes with the colour from all accepted neighbours, not from the nearest pixel,
-which may show another surface. Normals are brought to unit length, since rounded to half precision a normal's
-product with itself, to the power of 128, is anything from 0.88 to 1.13. The pass allows depths to differ by
-10 times their variation plus 0.01 scene units, which belongs to scenes of some metres: here it is 0.001 of
-the depth unless told. Antialiasing is a pass of its own in both; the one here is BMFR's.
+Mesh numbers, which the paper also compares, frames do not have. Direct and indirect light, which it filters
+by themselves, come as one `irradiance`. Slopes are those of `models.ops.slopes`, not of 2x2 pixels. The count
+of frames comes from all accepted neighbours, as the colour does; the pass takes the nearest pixel's, which
+may show another surface. Normals are brought to unit length: in half precision the 128th power of a normal's
+product with itself is anything from 0.88 to 1.13. The pass lets depths differ by 10 times their variation
+plus 0.01 scene units, which suits scenes of some metres; here it is 0.001 of the depth unless told.
+Antialiasing is a pass of its own in both; the one here is BMFR's. Luminances are multiplied by
+`exposure` before they are compared, since constants are added to their variance.
 
-Differences of luminance are taken of radiance times `exposure`, since the constants they are compared with
-have its unit.
+Last of nine frames of 320x180 with one sample per pixel (classroom, glossy Cornell box, living room; PSNR in
+dB, exposed, gamma 2.2): input 5.7, 15.5, 9.9; result 20.5, 24.4, 24.0; without antialiasing 19.7, 23.8, 23.3,
+and then with 4, the second, 0.05 and 10 from the table 20.1, 22.7, 22.5.
 """
 
 from __future__ import annotations
@@ -107,8 +109,8 @@ class SVGF(SequenceFilter):
         margin: Width of the border of the frame before that is not looked at.
         taa: Antialias the result over time, see `models.ops.antialiasing`.
         taa_new: Weight of the new frame there.
-        aux: Also return `history`, the number of frames, and `irradiance_variance` that entered the first
-            iteration (of the luminance, in squared units of the irradiance), both (B, 1, H, W).
+        aux: Also return `history`, the number of frames, and `variance`, that of the luminance which entered
+            the first iteration, in squared units of the irradiance, both (B, 1, H, W).
 
     Raises:
         ValueError: A number is out of its range or a word unknown.
@@ -188,7 +190,7 @@ class SVGF(SequenceFilter):
         planes = {"color": remembered / exposure, "moments": now.moments / scale, "count": now.frames}
         if self.taa_new is not None:
             planes["output"] = output
-        aux = {"history": now.frames, "irradiance_variance": variance / exposure.square()}
+        aux = {"history": now.frames, "variance": variance / exposure.square()}
         return Denoised(output, carried(**planes, **self._compared(seen)), aux if self.aux else None)
 
     def instead(self, available: Collection[str]) -> tuple[Denoiser, tuple[str, ...]] | None:
@@ -281,14 +283,11 @@ def _variance(moments: Tensor) -> Tensor:
 
 def _check(given: Mapping[str, Any]) -> None:
     positive = ("longest", "sigma_z", "sigma_n", "sigma_l", "depth_limit", "normal_limit", "least_share")
-    shares = {name: given[name] for name in ("alpha", "moments_alpha", "taa_new")}
-    limits = {name: given[name] for name in ("position_limit_squared",) if given[name] is not None}
-    checked("SVGF", positive={**{name: given[name] for name in positive}, **limits}, shares=shares)
-    floors = {name: given[name] or 0 for name in ("depth_floor", "normal_floor")}
-    counts = {name: given[name] for name in ("iterations", "margin", "young")}
-    for name, value in {**floors, **counts}.items():
-        if value < 0:
-            raise ValueError(f"SVGF: {name} must be at least 0, got {value}")
+    shares = ("alpha", "moments_alpha", "taa_new")
+    checked("SVGF", given, positive=(*positive, "position_limit_squared"), shares=shares)
+    for name in ("iterations", "margin", "young", "depth_floor", "normal_floor"):
+        if given[name] is not None and not given[name] >= 0:
+            raise ValueError(f"SVGF: {name} must be at least 0, got {given[name]}")
     if not 0 <= given["feedback"] <= given["iterations"]:
         raise ValueError(
             f"SVGF: feedback must be an iteration, 0 to {given['iterations']}, got {given['feedback']}"

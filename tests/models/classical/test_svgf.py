@@ -47,9 +47,7 @@ def assert_equals_transcription(arguments: dict[str, Any], options: Options, fra
         assert result.aux is not None
         np.testing.assert_allclose(image(result.color), truth["color"], rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(image(result.aux["history"]), truth["count"], rtol=1e-9)
-        np.testing.assert_allclose(
-            image(result.aux["irradiance_variance"]), truth["variance"], rtol=1e-6, atol=1e-12
-        )
+        np.testing.assert_allclose(image(result.aux["variance"]), truth["variance"], rtol=1e-6, atol=1e-12)
 
 
 def test_with_its_defaults_it_is_its_transcription() -> None:
@@ -104,7 +102,7 @@ def test_the_variance_of_old_pixels_is_that_of_their_own_luminance_over_time() -
     grey = torch.stack([(buffers["irradiance"] * weights).sum(1) for buffers in frames])
     found = run(network, frames)[-1].aux
     assert found is not None
-    torch.testing.assert_close(found["irradiance_variance"][:, 0], grey.var(0, unbiased=False))
+    torch.testing.assert_close(found["variance"][:, 0], grey.var(0, unbiased=False))
 
 
 @pytest.mark.parametrize("slope", ["steepest", "along"])
@@ -203,9 +201,9 @@ def test_without_positions_it_offers_to_compare_depths() -> None:
         ({"iterations": -1, "feedback": 0}, "iterations must be at least 0"),
         ({"alpha": 0.0}, "alpha must be above 0 and at most 1"),
         ({"moments_alpha": 1.5}, "moments_alpha must be above 0 and at most 1"),
-        ({"sigma_l": 0.0}, "sigma_l must be positive"),
-        ({"sigma_n": NAN}, "sigma_n must be positive"),
-        ({"position_limit_squared": -1.0}, "position_limit_squared must be positive"),
+        ({"sigma_l": 0.0}, "sigma_l must be above 0"),
+        ({"sigma_n": NAN}, "sigma_n must be above 0"),
+        ({"position_limit_squared": -1.0}, "position_limit_squared must be above 0"),
         ({"depth_floor": -1.0}, "depth_floor must be at least 0"),
         ({"slope": "flat"}, "slope must be steepest or along"),
         ({"geometry": "mesh"}, "geometry must be depth or position"),
