@@ -5,10 +5,10 @@ of the depth at p, and kernel numbers k,
 
     w(p, q) = k(q - p) max(0, n_p n_q)^sigma_n exp(-|z_p - z_q| / (sigma_z max(d, 1e-8)) - |l_p - l_q| / r_p)
 
-(Schied et al. 2017, doi:10.1145/3105762.3105770, equations 2 to 5), where d is what the depth may change by
-from p to q: the steeper of both slopes times their distance, as in released code (`steepest`), or the slope
-in their direction times it, as in the paper (`along`). r says how different luminances may be. The pixel's
-own weight is k(0); pixels outside the image and those that hit nothing take no part.
+(Schied et al. 2017, doi:10.1145/3105762.3105770), where d is what the depth may change by from p to q:
+the steeper of both slopes times their distance, as in released code (`steepest`), or the slope in their
+direction times it, as in the paper (`along`). r says how different luminances may be. The pixel's own weight
+is k(0); pixels outside the image and those that hit nothing take no part.
 
 Works on images, one tap after the other, so that no array grows with the number of taps; on a CPU some rows
 at a time.

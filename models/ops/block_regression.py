@@ -17,8 +17,8 @@ reconstruction is without it.
 Source: Koskela et al. 2019, doi:10.1145/3269978, with the numbers of the released code, where the extrema are
 divided by only if they are more than 1 apart (`scale="large"`), and block data is rounded to half precision
 (`half`). Its noise comes from an integer hash; here it is the finaliser of MurmurHash3, of 32 bits.
-Equations are solved by QR factorisation there; normal equations summed up in float64 give the same to 1e-6,
-since the noise bounds the condition.
+Equations are solved by QR factorisation there; normal equations summed up in float64 give the same up to
+rounding, since the noise bounds their condition.
 """
 
 from __future__ import annotations
