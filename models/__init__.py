@@ -6,11 +6,13 @@
 
 from models.acfm import ACFM
 from models.afgsa import AFGSA
+from models.classical.bmfr import BMFR
 from models.classical.cross_bilateral import CrossBilateral
 from models.classical.joint_bilateral import JointBilateral
 from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
+from models.classical.svgf import SVGF
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
@@ -26,6 +28,7 @@ from models.wskp_mr import MultiResolutionWSKP
 __all__ = [
     "ACFM",
     "AFGSA",
+    "BMFR",
     "KP",
     "KPCN",
     "MRKP",
@@ -34,6 +37,7 @@ __all__ = [
     "NLM",
     "RAE",
     "SBMC",
+    "SVGF",
     "WSKP",
     "CrossBilateral",
     "JointBilateral",

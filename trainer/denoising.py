@@ -225,6 +225,8 @@ class ClipDenoiser:
         follows = self._follows(frame)
         previous = self._last.camera if follows and self._last is not None else None
         frame.notes["sequence"] = self.clip.sequence
+        if not follows:
+            frame = self._unmoved(frame)
         model, reasons = self._fitting.fit(frame, self.clip.depth, previous)
         try:
             frame = derive(frame, self._wanted(frame, model), depth_kind=self.clip.depth, previous=previous)
@@ -272,6 +274,13 @@ class ClipDenoiser:
             attention,
             {name: _image(layer) for name, layer in aux.items()},
         )
+
+    def _unmoved(self, frame: Frame) -> Frame:
+        """Return the first frame of a sequence with motion 0, where a recurrent method reads motion."""
+        lacking = {*self.model.inputs} - frame.buffers.keys()
+        if getattr(self.model, "recurrent", False) and "motion" in lacking:
+            return frame.with_buffers(motion=np.zeros((frame.height, frame.width, 2), np.float32))
+        return frame
 
     def _follows(self, frame: Frame) -> bool:
         last = self._last

@@ -12,23 +12,15 @@ from typing import Any
 
 from torch import Tensor
 
-from models.denoiser import Buffers, Denoiser
+from models.denoiser import Buffers, Denoiser, State
 from models.ops.antialiasing import antialiased
 from models.ops.guides import finite
 from models.ops.reproject import Neighbours
 from models.ops.tonemap import LARGEST
 
-State = dict[str, Tensor]
-"""Detached tensors (B, …) by name."""
-
 
 class SequenceFilter(Denoiser):
-    """Base class of filters with `forward(buffers, state)`.
-
-    Attributes:
-        recurrent: `forward` takes the state that it returned for the frame before.
-        whole: It must see whole frames.
-    """
+    """Base class of filters with `forward(buffers, state)`, whose states are detached tensors (B, …)."""
 
     recurrent = True
     whole = True

@@ -44,8 +44,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from models.classical.sequence_filter import SequenceFilter, State, carried, checked, follows
-from models.denoiser import Buffers, Denoised, Denoiser
+from models.classical.sequence_filter import SequenceFilter, carried, checked, follows
+from models.denoiser import Buffers, Denoised, Denoiser, State
 from models.ops.atrous import (
     EdgeStops,
     Slope,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from data.exr import read_frame
-from models import RAE
+from models import RAE, SVGF
 from models.denoiser import State
 from tests.trainer.test_denoise_classical import frame, run, write
 from trainer.export import SUFFIXES, export, load_artifact
@@ -108,6 +108,32 @@ def test_frames_of_another_size_start_a_sequence(
     small = clip(tmp_path / "small", (2, 3), size=(16, 28))
     found = [read_frame(tmp_path / "out" / f"f{index:03d}.exr").buffers["color"] for index in (2, 3)]
     close(np.stack(found), expected(network, small))
+
+
+def test_nothing_has_moved_in_the_first_frame_of_a_sequence(tmp_path: Path) -> None:
+    names = tuple(name for name in SVGF.inputs if name != "motion")
+    for index in range(3):
+        made = frame(*names, size=SIZE, seed=index, index=index)
+        if index:
+            made.buffers["motion"] = np.full((*SIZE, 2), 0.25, np.float32)
+        write(tmp_path / "in" / f"f{index:03d}.exr", made)
+    found = denoised(tmp_path / "in", tmp_path / "out", Path("SVGF"))
+    method, state, colors = SVGF(), None, []
+    for path in sorted((tmp_path / "in").glob("*.exr")):
+        read = read_frame(path).buffers
+        read.setdefault("motion", np.zeros((*SIZE, 2), np.float32))
+        buffers = {n: torch.from_numpy(read[n].transpose(2, 0, 1).copy())[None] for n in method.inputs}
+        color, state, _ = method(buffers, state)
+        colors.append(color[0].permute(1, 2, 0).numpy())
+    close(found, np.stack(colors))
+
+
+def test_a_later_frame_without_motion_is_refused(tmp_path: Path) -> None:
+    names = tuple(name for name in SVGF.inputs if name != "motion")
+    for index in range(2):
+        write(tmp_path / "in" / f"f{index:03d}.exr", frame(*names, size=SIZE, seed=index, index=index))
+    with pytest.raises(ValueError, match="missing buffer 'motion'"):
+        run(tmp_path / "in", "--model", "SVGF", "--output", tmp_path / "out")
 
 
 def test_files_name_their_state_and_how_a_sequence_starts(files: dict[str, Path]) -> None:

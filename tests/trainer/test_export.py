@@ -189,6 +189,17 @@ def test_methods_of_hundreds_of_offsets_are_refused_with_the_reason(tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+FILTERS = {"BMFR", "SVGF"}
+"""Methods that look anywhere in the frame before."""
+
+
+@pytest.mark.parametrize("name", sorted(FILTERS))
+def test_filters_of_sequences_are_refused_with_the_reason(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} cannot be exported: each of its frames needs the state"):
+        export(make(name), tmp_path / "net.onnx")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, format: str) -> None:
     net = models.JointBilateral(radius=2)
@@ -196,7 +207,9 @@ def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, f
 
 
 @pytest.mark.parametrize("format", FORMATS)
-@pytest.mark.parametrize("name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"} - UNROLLED))
+@pytest.mark.parametrize(
+    "name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"} - UNROLLED - FILTERS)
+)
 def test_every_network_is_exported_and_takes_any_size(tmp_path: Path, name: str, format: str) -> None:
     torch.manual_seed(3)
     net = make(name)
