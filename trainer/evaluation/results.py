@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from trainer.evaluation.plan import Setting
 from trainer.evaluation.plots import write_plots
 from trainer.evaluation.record import write_record, write_rows, write_tables
 from trainer.evaluation.running import Outcome
-from trainer.evaluation.scoring import PROCESSES
+from trainer.evaluation.scoring import PROCESSES, quiet
 from trainer.evaluation.sheets import write_sheets
 from trainer.evaluation.tables import Scored
 from trainer.evaluation.tracking import EXPERIMENT, Tracked, keep_files, track, training_url
@@ -66,11 +66,14 @@ def write_results(
 
 @contextmanager
 def _drawn(*plots: Any) -> Iterator[None]:
-    """Draw plots in another process meanwhile; raises as `write_plots`."""
-    with ProcessPoolExecutor(1, PROCESSES) as pool:
+    """Draw plots in another process meanwhile, and here where that was killed; raises as `write_plots`."""
+    with ProcessPoolExecutor(1, PROCESSES, initializer=quiet) as pool:
         drawing = pool.submit(write_plots, *plots)
         yield
-        drawing.result()
+        try:
+            drawing.result()
+        except BrokenExecutor:
+            write_plots(*plots)
 
 
 def record_files(tracked: Tracked, folder: Path, say: Say) -> None:

@@ -77,7 +77,7 @@ class Scorers:
             return self._pool.submit(score, question)
 
     def _started(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(self.cores, PROCESSES, initializer=_quiet)
+        return ProcessPoolExecutor(self.cores, PROCESSES, initializer=quiet)
 
     def _end(self, done: Done, answer: Future[dict[str, float]]) -> None:
         try:
@@ -89,7 +89,7 @@ class Scorers:
                 self._changed.notify_all()
 
 
-def _quiet() -> None:
-    """Let processes that take scores give way to the methods, and end silently with Ctrl-C."""
+def quiet() -> None:
+    """Let a process give way to the methods, and end silently with Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(5)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from trainer.evaluation import scoring
+from trainer.evaluation import results, scoring
 from trainer.evaluation.scoring import Scorers
 
 
@@ -26,6 +26,20 @@ def answers(monkeypatch):
     monkeypatch.setattr(scoring, "score", took)
     found = []
     return found
+
+
+def draw(place, here):
+    """Stands for `write_plots`: dies anywhere but in the process `here`."""
+    if os.getpid() != here:
+        os.kill(os.getpid(), signal.SIGKILL)
+    place.write_text("plots")
+
+
+def test_plots_are_drawn_here_where_the_process_that_draws_them_was_killed(monkeypatch, tmp_path):
+    monkeypatch.setattr(results, "write_plots", draw)
+    with results._drawn(tmp_path / "plots", os.getpid()):
+        (tmp_path / "page").write_text("page")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page", "plots"]
 
 
 def test_every_question_is_answered_before_the_block_ends(answers):
