@@ -189,14 +189,17 @@ class ClipDenoiser:
 
     def _carried(self, prepared: Prepared, buffers: Mapping[str, Tensor]) -> State | None:
         """Return the state of the frame before; None where this one does not follow it."""
+        sizes = tuple(buffers[prepared.model.inputs[0]].shape)
+        first, follows = not self._size, prepared.follows and sizes == self._size
+        self._size = sizes
         if getattr(prepared.model, "recurrent", False):
-            name, clip = self.loaded.source.reference, self.clip
+            name, clip, label = self.loaded.source.reference, self.clip, prepared.frame.label
             if not clip.sequence:
                 self.say(f"the frames are independent views: {name} denoises each as the first of a sequence")
             elif len(clip.items) == 1:
                 self.say(f"a single frame: {name} denoises it as the first of a sequence")
-        sizes = tuple(buffers[prepared.model.inputs[0]].shape)
-        follows, self._size = prepared.follows and sizes == self._size, sizes
+            elif not (first or follows):
+                self.say(f"{label} does not go on from the frame before: {name} starts a new sequence there")
         return self._state if follows else None
 
     def pace(self, model: Model, buffers: Mapping[str, Tensor]) -> Pace | None:

@@ -85,9 +85,27 @@ def test_the_state_is_cut_into_tiles(network: RAE, files: dict[str, Path], tmp_p
     close(found, expected(network, source))
 
 
-def test_a_missing_frame_starts_a_sequence(network: RAE, files: dict[str, Path], tmp_path: Path) -> None:
+def test_a_missing_frame_starts_a_sequence_which_is_said(
+    network: RAE, files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = clip(tmp_path / "in", (0, 1, 4, 5))
     close(denoised(source, tmp_path / "out", files["onnx"]), expected(network, source, (0, 2)))
+    told = "".join(capsys.readouterr())
+    assert told.count("starts a new sequence there") == 1
+    assert "frame 4 does not go on from the frame before" in told
+
+
+def test_frames_after_those_that_are_finished_are_not_denoised_without_their_state(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
+    source = clip(tmp_path / "in")
+    whole = denoised(source, tmp_path / "out", files["onnx"])
+    (tmp_path / "out" / "f002.exr").unlink()
+    again = (source, "--model", files["onnx"], "--output", tmp_path / "out", "--exposure", "1")
+    with pytest.raises(ValueError, match=r"already there \(2 in all\); --force replaces them"):
+        run(*again)
+    assert not (tmp_path / "out" / "f002.exr").exists()
+    np.testing.assert_array_equal(denoised(source, tmp_path / "out", files["onnx"], "--force"), whole)
 
 
 def test_a_single_frame_is_told_to_be_the_first_of_a_sequence(
