@@ -191,6 +191,11 @@ class Shards(LightningDataModule):
         """Return the scenes of a split, in order."""
         return tuple(self.index.scenes(split))
 
+    def independent_views(self, split: str) -> tuple[str, ...]:
+        """Return the scenes of a split whose frames do not follow one another, in order."""
+        found = self.index.manifest["scenes"]
+        return tuple(scene for scene in self.scenes(split) if not found[scene]["sequence"])
+
     def counts(self) -> dict[str, int]:
         """Return the number of samples of each split."""
         return {split: self.index.count(split) for split in ("train", "validation", "test")}
@@ -280,10 +285,12 @@ class Shards(LightningDataModule):
     def _batches(self, split: str, augmentation: Augmentation | None) -> Batches:
         index = self.index
         if split != "test" and index.frames != self.frames:
+            # Who trains on clips cannot take single frames instead, nor the other way round.
+            fits = min(index.frames, self.frames) > 1
             raise ValueError(
                 f"{index.place} holds {_samples_text(index.frames)}, and {_samples_text(self.frames)} are to "
-                f"be read: set --data.frames {index.frames}, or prepare again: trainer prepare FRAMES "
-                f"--output SHARDS --clip-frames {self.frames}"
+                f"be read: {f'set --data.frames {index.frames}, or ' if fits else ''}prepare again: trainer "
+                f"prepare FRAMES --output SHARDS --clip-frames {self.frames}"
             )
         cache = None if index.url is None else ShardCache(index, round(self.cache_gb * 1e9))
         reader = ShardReader(index, split, self.verify, cache)

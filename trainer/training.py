@@ -25,6 +25,7 @@ from trainer.callbacks.mirror import MirrorRun
 from trainer.callbacks.recorder import RunRecorder
 from trainer.callbacks.same_start import SameStart
 from trainer.elastic import heed_failures, join_ranks
+from trainer.modules.evaluation import Evaluated
 from trainer.tracking import MLflowTracking
 
 TRACKING = "trainer.tracking.MLflowTracking"
@@ -276,6 +277,8 @@ class TrainingCLI(LightningCLI):
         except ValueError as error:
             raise ValueError(refused(str(error))) from error
         check_manual(self.model, self.trainer)
+        if self.config.subcommand != "test":  # there all samples are whole frames
+            check_clips(self.model, self.datamodule)
         join_ranks(self.trainer)
         heed_failures(self.trainer)
         more = [SameStart()] * (self.trainer.world_size > 1) + [Alive()] * bool(os.environ.get(ALIVE))
@@ -343,6 +346,24 @@ def check_manual(module: LightningModule, trainer: Trainer) -> None:
             f"{name} accumulates gradients itself: use --model.accumulate {trainer.accumulate_grad_batches} "
             "and --trainer.accumulate_grad_batches 1"
         )
+
+
+def check_clips(module: LightningModule, data: Any) -> None:
+    """Raise a ValueError where a module trains on clips and the data are images, or the other way round."""
+    frames = getattr(data, "frames", None)
+    if not isinstance(module, Evaluated) or not isinstance(frames, int) or module.clips == (frames > 1):
+        return
+    name = type(module).__name__
+    if module.clips:
+        raise ValueError(
+            f"{name} trains on clips, and the data are single frames: use --data.recipe recurrent, or "
+            "--data.frames N with shards of clips"
+        )
+    raise ValueError(
+        f"{name} trains on single frames, and the data are clips of {frames} frames: leave out --data.recipe "
+        "recurrent and --data.frames; clips are for networks with a memory, which trainer.modules.Sequence "
+        "trains"
+    )
 
 
 def expected_critics(arguments: Any) -> str:

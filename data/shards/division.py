@@ -145,10 +145,11 @@ def _leave_out_short(
     for split, kind in (("train", "training"), ("validation", "validation")):
         short = lacking(frames, chosen[split], options.frames)
         if short and len(short) == len(chosen[split]) and (split == "train" or options.validation_patches):
+            moving = any(frames.manifest.scenes[scene].sequence for scene in short)
+            way = "take shorter clips, --clip-frames N (in training --data.frames N), or longer sequences"
             raise ValueError(
                 f"{frames.root} has no {kind} scene with {options.frames} consecutive frames of one "
-                f"sequence: {listed(short)}; take shorter clips, --clip-frames N (in training --data.frames "
-                "N), or longer sequences"
+                f"sequence: {listed(short)}; {way if moving else 'use data of sequences'}"
             )
         chosen[split] = {scene: records for scene, records in chosen[split].items() if scene not in short}
 

@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from data.augment import Augmentation, reordered, turned
 from data.ingestion import write_record
-from data.manifest import Manifest, SceneRecord
+from data.manifest import Manifest, SceneRecord, load_manifest
 from data.module import Shards
 from data.sample import SAMPLES
 from data.shards.batch import Batches, Order
@@ -216,8 +216,9 @@ def test_shards_of_another_length_than_asked_are_refused_with_the_way_out(index,
     for loader in (data.train_dataloader, data.val_dataloader):
         with pytest.raises(
             ValueError,
-            match=rf"holds clips of 4 frames, and {asked} are to be read: set --data\.frames 4, or prepare "
-            rf"again: trainer prepare FRAMES --output SHARDS --clip-frames {frames or 1}",
+            match=rf"holds clips of 4 frames, and {asked} are to be read: "
+            + (r"set --data\.frames 4, or prepare again: " if frames == 7 else "prepare again: ")
+            + f"trainer prepare FRAMES --output SHARDS --clip-frames {frames or 1}",
         ):
             loader()
     assert next(iter(data.test_dataloader()))["color"].shape == (1, 3, 40, 48)
@@ -335,6 +336,18 @@ def test_two_ranks_test_whole_scenes_in_the_order_of_their_frames(index: Index, 
         seen.append([(batch["scene"][0], int(batch["frame"])) for batch in batches])
     cave, dome, arch = ([(s, i) for i in range(n)] for s, n in (("cave", 5), ("dome", 5), ("arch", 2)))
     assert seen == [[*cave, *arch], dome]
+
+
+def test_scenes_whose_frames_do_not_follow_one_another_are_named(index: Index, tmp_path: Path):
+    assert module(index).independent_views("test") == ()
+    root = write_set(tmp_path / "frames")
+    known = load_manifest(root)
+    views = {name: replace(record, sequence=name != "cave") for name, record in known.scenes.items()}
+    replace(known, scenes=views).save(root)
+    data = Shards(str(prepare(root, tmp_path / "shards", OPTIONS).root), workers=0)
+    assert "cave" in data.scenes("test")
+    assert data.independent_views("test") == ("cave",)
+    assert data.independent_views("train") == ()
 
 
 def test_validation_is_dealt_clip_by_clip_also_with_whole_scenes(index: Index, monkeypatch):

@@ -219,6 +219,9 @@ def test_it_is_an_error_that_names_the_scenes_where_no_clip_fits(tmp_path: Path)
     )
     with pytest.raises(ValueError, match=expected):
         plan_shards(FrameSet(root), CLIPS)
+    views = mixed_set(tmp_path / "views", ("views",))
+    with pytest.raises(ValueError, match="sequence: views is no sequence; use data of sequences"):
+        plan_shards(FrameSet(views), CLIPS)
 
 
 def test_it_is_an_error_where_no_clip_fits_into_the_scenes_for_validation(tmp_path: Path):

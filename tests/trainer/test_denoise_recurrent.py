@@ -15,6 +15,7 @@ from models import RAE, SVGF
 from models.denoiser import State
 from tests.trainer.test_denoise_classical import frame, run, write
 from trainer.export import SUFFIXES, export, load_artifact
+from trainer.export.register import log_and_register, using_store
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -145,6 +146,33 @@ def test_files_name_their_state_and_how_a_sequence_starts(files: dict[str, Path]
         "hidden1": (5, 2),
         "hidden2": (5, 4),
     }
+
+
+@pytest.mark.slow
+def test_a_registered_model_takes_and_returns_its_state_through_pyfunc(
+    network: RAE, files: dict[str, Path], tmp_path: Path
+) -> None:
+    import mlflow
+    from mlflow.tracking import MlflowClient
+
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    client = MlflowClient(uri, uri)
+    place = client.create_experiment("test", artifact_location=(tmp_path / "artifacts").as_uri())
+    version = log_and_register(client.create_run(place).info.run_id, files["onnx"], "rae", uri)
+    with using_store(uri):
+        model = mlflow.pyfunc.load_model(f"models:/rae/{version}")
+    maps = {
+        name: np.zeros((1, c, 20 // s, 24 // s), np.float32) for name, (c, s) in network.state_maps.items()
+    }
+    state: State | None = None
+    for seed in range(2):
+        buffers = {n: b.transpose(2, 0, 1)[None].copy() for n, b in frame(*INPUTS, seed=seed).buffers.items()}
+        made = model.predict({**buffers, "exposure": np.ones(1, np.float32), **maps})
+        maps = {name: made[f"next_{name}"] for name in maps}
+        with torch.no_grad():
+            given = {name: torch.from_numpy(array) for name, array in buffers.items()}
+            wanted, state, _ = network(given, state)
+        close(made["color"], wanted.numpy())
 
 
 def test_torchscript_carries_the_state_without_penumbra(network: RAE, files: dict[str, Path]) -> None:

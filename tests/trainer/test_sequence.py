@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning.pytorch as lightning
@@ -17,9 +18,10 @@ from models import RAE, WSKP
 from tests.synthetic import Synthetic, patch
 from trainer.callbacks import LastCheckpoint
 from trainer.losses import Recurrent
-from trainer.modules import Sequence
+from trainer.modules import Regression, Sequence
 from trainer.modules.sequence import frames
 from trainer.schedules import InverseRoot
+from trainer.training import check_clips
 
 pytestmark = [
     pytest.mark.usefixtures("one_thread"),
@@ -141,6 +143,53 @@ def test_tests_carry_the_state_until_scene_or_order_ends() -> None:
             alone = trained.net({name: image[name] for name in (*trained.net.inputs, "depth_range")}).color
             carried.append(not torch.equal(trained(given).color, alone))
     assert carried == [False, True, False, False, True]
+
+
+def test_views_and_frames_that_count_nowhere_are_first_ones(tmp_path: Path) -> None:
+    carried = []
+
+    class Watched(Sequence):
+        def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+            alone = self.net({name: batch[name] for name in (*self.net.inputs, "depth_range")}).color
+            carried.append(not torch.equal(self(batch).color, alone))
+
+    class Views(Synthetic):
+        def independent_views(self, split: str) -> tuple[str, ...]:
+            return ("plane",) if split == "test" else ()
+
+        def test_dataloader(self) -> DataLoader[dict[str, Any]]:
+            scenes = (["step"], ["step"], ["plane"], ["plane"], [], [])
+            images = [next(iter(DataLoader([patch(place)]))) for place in range(6)]  # type: ignore[arg-type]
+            batches = [{**image, "scene": scene} for image, scene in zip(images, scenes, strict=True)]
+            return DataLoader(batches, None)  # type: ignore[arg-type]
+
+    torch.manual_seed(5)
+    watched = Watched(RAE(stages=(4, 5), tail=(6, 5)))
+    watched.on_test_epoch_end = lambda: None  # type: ignore[method-assign]  # there are no scores
+    trainer(tmp_path).test(watched, datamodule=Views(), verbose=False)
+    assert carried == [False, True, False, False, False, False]
+
+
+def test_a_test_on_several_ranks_needs_whole_scenes() -> None:
+    tested = module()
+    for whole, world in ((True, 2), (False, 1)):
+        tested.check_ranks(SimpleNamespace(whole_scenes=whole), world)
+    with pytest.raises(
+        ValueError, match=r"2 processes would get every other frame .* --data\.whole_scenes true"
+    ):
+        tested.check_ranks(SimpleNamespace(whole_scenes=False), 2)
+
+
+def test_clips_and_images_for_the_wrong_training_are_refused_before_anything_is_prepared() -> None:
+    clips, images = SimpleNamespace(frames=7), SimpleNamespace(frames=1)
+    check_clips(module(), clips)
+    check_clips(Regression(WSKP()), images)
+    for trained in (module(), Regression(WSKP())):
+        check_clips(trained, Synthetic())  # says nothing of clips
+    with pytest.raises(ValueError, match=r"Sequence trains on clips, .* use --data\.recipe recurrent"):
+        check_clips(module(), images)
+    with pytest.raises(ValueError, match="Regression trains on single frames, and the data are clips of 7"):
+        check_clips(Regression(WSKP()), clips)
 
 
 def test_a_picture_shows_the_last_frame() -> None:

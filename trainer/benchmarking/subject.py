@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from models.denoiser import Denoiser
+from models.denoiser import Denoised, Denoiser, State
 from models.tiling import denoise_in_tiles
 from trainer.benchmarking.cases import Case, Method
 from trainer.building import build, class_path_of, find_class
@@ -72,7 +72,7 @@ class Subject:
         self.forget()
 
     def forget(self) -> None:
-        """Release what a call leaves behind: gradients and the optimiser's state."""
+        """Release what calls leave behind: gradients and the optimiser's state, or that of the sequence."""
         self._small = None
         self._step.forget()
 
@@ -134,23 +134,33 @@ def _autocast(case: Case) -> torch.autocast:
 
 
 class _Inference:
-    """What `trainer denoise` does with a frame that is in memory: whole, or in tiles where memory asks."""
+    """What `trainer denoise` does with a frame that is in memory: whole, or in tiles where memory asks.
+
+    Recurrent methods always do the second frame of a sequence: most frames have one before, and the first of
+    some methods is less work.
+    """
 
     def __init__(self, model: Model, case: Case) -> None:
         self.model, self.case = model.deploy().eval(), case
         self._call: Any = self.model
         if case.mode == "compiled":
             self._call = torch.compile(self._call, dynamic=False)
+        self._state: State | None = None
 
     def images(self, case: Case) -> dict[str, Tensor]:
         return _images(self.model, self.model.inputs, case)
 
     def forget(self) -> None:
-        """Nothing is left behind."""
+        self._state = None
 
     def __call__(self, images: dict[str, Tensor]) -> None:
+        if self.model.recurrent and self._state is None:
+            self._state = self._denoised(images).state
+        self._denoised(images)
+
+    def _denoised(self, images: dict[str, Tensor]) -> Denoised:
         with torch.inference_mode(), _autocast(self.case):
-            denoise_in_tiles(self._call, images, budget=self.case.memory)
+            return denoise_in_tiles(self._call, images, budget=self.case.memory, state=self._state)
 
 
 class _Training:

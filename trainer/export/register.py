@@ -20,7 +20,8 @@ from torch import nn
 
 from data.buffers import SAMPLES, buffer, sample_channels
 from trainer.export.artifact import Artifact, load_artifact
-from trainer.export.entry import Sampled, default, example
+from trainer.export.entry import Sampled, default, example, first_state
+from trainer.export.onnx import following
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
@@ -44,8 +45,8 @@ def log_and_register(
     The signature lists the buffers with free batch, height, width and number of samples, and `exposure`:
     MLflow drops inputs that a signature does not list, and an exposure that is silently dropped gives a wrong
     picture; the same goes for `thin_lens`. The depth range is left to the model, which measures it from the
-    image. `mlflow.pyfunc.load_model(uri).predict` takes a dictionary of float32 arrays and returns
-    `{"color": …}`.
+    image. Maps of a recurrent method's state are inputs and, with other names, outputs.
+    `mlflow.pyfunc.load_model(uri).predict` takes a dictionary of float32 arrays and returns `{"color": …}`.
 
     Args:
         run_id: Run that the model belongs to.
@@ -206,10 +207,11 @@ def _signature(artifact: Artifact) -> Any:
     inputs: list[Any] = [TensorSpec(single, _shape(name, artifact), name) for name in artifact.inputs]
     for name in _listed(artifact):
         inputs.append(TensorSpec(single, (-1, *default(name).shape[1:]), name))
-    return ModelSignature(
-        inputs=Schema(inputs),
-        outputs=Schema([TensorSpec(single, (-1, 3, -1, -1), artifact.description.output)]),
-    )
+    outputs: list[Any] = [TensorSpec(single, (-1, 3, -1, -1), artifact.description.output)]
+    for name, (channels, _) in artifact.state_maps.items():
+        inputs.append(TensorSpec(single, (-1, channels, -1, -1), name))
+        outputs.append(TensorSpec(single, (-1, channels, -1, -1), following(name)))
+    return ModelSignature(inputs=Schema(inputs), outputs=Schema(outputs))
 
 
 def _shape(name: str, artifact: Artifact) -> tuple[int, ...]:
@@ -221,6 +223,7 @@ def _shape(name: str, artifact: Artifact) -> tuple[int, ...]:
 
 def _example(artifact: Artifact) -> dict[str, Any]:
     made = example(artifact.inputs, 1, *EXAMPLE_SIZE, samples=Sampled(artifact.samples, EXAMPLE_SAMPLES))
+    made |= first_state(artifact.state_maps, 1, *EXAMPLE_SIZE, artifact.multiple)
     arrays = {name: value.numpy() for name, value in made.items()}
     return arrays | {name: default(name).numpy() for name in _listed(artifact)}
 

@@ -57,7 +57,12 @@ class Evaluated(LightningModule):
 
     Args:
         net: The denoiser to train.
+
+    Attributes:
+        clips: Training and validation samples are clips, (B, T, C, H, W), instead of images.
     """
+
+    clips = False
 
     def __init__(self, net: Denoiser) -> None:
         super().__init__()

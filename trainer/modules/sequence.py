@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,8 +20,8 @@ class Sequence(Regression):
 
     Training and validation batches hold sequences (B, T, C, H, W) (`data.Shards` with `recipe: recurrent`):
     the first frame starts without a state, and gradients flow back through all T frames. Test frames come
-    one at a time, in order; the state is carried until another scene begins or a frame is missing. Metrics
-    are averages over all frames, first ones included.
+    one at a time, in order; the state is carried until another scene begins or a frame is missing, and not
+    between independent views. Metrics are averages over all frames, first ones included.
 
     Args:
         net: The denoiser to train; with `recurrent`.
@@ -33,6 +34,8 @@ class Sequence(Regression):
     Raises:
         ValueError: The denoiser carries no state, or a clip is not positive.
     """
+
+    clips = True
 
     def __init__(
         self,
@@ -48,6 +51,7 @@ class Sequence(Regression):
         if not net.recurrent:
             raise ValueError(f"{type(net).__name__} carries no state from frame to frame; use Regression")
         self._tested = Tested()
+        self._views: frozenset[str] = frozenset()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Return the loss of one batch."""
@@ -72,11 +76,25 @@ class Sequence(Regression):
         """Start new sums and a new sequence."""
         super().on_test_epoch_start()
         self._tested = Tested()
+        data = self.trainer.datamodule  # type: ignore[attr-defined]
+        self.check_ranks(data, self.trainer.world_size)
+        views = getattr(data, "independent_views", None)
+        self._views = frozenset(views("test") if views is not None else ())
+
+    def check_ranks(self, data: Any, world: int) -> None:
+        """Raise a ValueError where no process would see two frames of a test in a row."""
+        if world > 1 and not getattr(data, "whole_scenes", True):
+            raise ValueError(
+                f"{type(self.net).__name__} carries a state from frame to frame, and {world} processes would "
+                "get every other frame of a test or fewer: use --data.whole_scenes true"
+            )
 
     def forward(self, batch: Batch) -> Denoised:
         """Denoise the next whole frame of a test."""
-        result: Denoised = self.net(select(self.net, batch), self._tested.state(batch))
-        self._tested = Tested(*_place(batch), result.state)
+        place = self._place(batch)
+        follows = place is not None and place == self._tested.following
+        result: Denoised = self.net(select(self.net, batch), self._tested.state if follows else None)
+        self._tested = Tested() if place is None else Tested((place[0], place[1] + 1), result.state)
         return result
 
     def pictured(self, batch: Batch) -> tuple[Batch, Denoised]:
@@ -97,27 +115,22 @@ class Sequence(Regression):
             state = result.state
             yield pair, result
 
+    def _place(self, batch: Batch) -> tuple[str, int] | None:
+        """Return scene and number of a test frame; None: it belongs to no sequence, or counts nowhere."""
+        scene = str(batch["scene"][0]) if batch["scene"] else None
+        return None if scene is None or scene in self._views else (scene, int(batch["frame"][0]))
 
-class Tested:
+
+class Tested(NamedTuple):
     """Where a test is.
 
-    Args:
-        scene: Of the last frame; None: there was none.
-        frame: Its number.
-        carried: Its state.
+    Attributes:
+        following: Scene and number of the frame that would go on with the state.
+        state: Of the last frame; None: there was none.
     """
 
-    def __init__(self, scene: str | None = None, frame: int = 0, carried: State | None = None) -> None:
-        self.scene, self.frame, self.carried = scene, frame, carried
-
-    def state(self, batch: Batch) -> State | None:
-        """Return the state that a frame goes on with; None: it does not follow the last one."""
-        follows = _place(batch) == (self.scene, self.frame + 1)
-        return self.carried if follows else None
-
-
-def _place(batch: Batch) -> tuple[str, int]:
-    return str(batch["scene"][0]), int(batch["frame"][0])
+    following: tuple[str, int] | None = None
+    state: State | None = None
 
 
 def frames(batch: Batch) -> Iterator[Batch]:

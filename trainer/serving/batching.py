@@ -213,7 +213,13 @@ def _together(tiles: list[_Tile]) -> list[Denoised]:
         joined = {name: torch.cat([tile.buffers[name] for tile in tiles]) for name in names}
         result = call(joined)
     counts = [next(iter(tile.buffers.values())).shape[0] for tile in tiles]
-    color = result.color.split(counts)
-    aux = result.aux or {}
-    parts = {name: image.split(counts) for name, image in aux.items()}
-    return [Denoised(color[i], aux={n: p[i] for n, p in parts.items()} or None) for i in range(len(tiles))]
+    color, state, aux = (_divided(maps, counts) for maps in ({"": result.color}, result.state, result.aux))
+    return [Denoised(c[""], s, a) for c, s, a in zip(color, state, aux, strict=True)]
+
+
+def _divided(maps: Mapping[str, Tensor] | None, counts: list[int]) -> list[Any]:
+    """Return the maps of each tile of a batch, by name; None for each where there are none."""
+    if not maps:
+        return [None] * len(counts)
+    parts = {name: whole.split(counts) for name, whole in maps.items()}
+    return [{name: part[tile] for name, part in parts.items()} for tile in range(len(counts))]

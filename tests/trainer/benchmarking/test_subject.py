@@ -49,6 +49,22 @@ def test_inference_measures_the_deployed_form():
     assert measured == sum(weight.numel() for weight in models.WSKP().deploy().parameters())
 
 
+def test_recurrent_methods_go_on_with_a_state_of_the_size_of_the_images():
+    measured = subject("RAE", "stages=4,5", "tail=6,5", width=96, height=80)
+    seen = []
+    forward = measured._step.model.forward
+
+    def watched(buffers, state=None):
+        seen.append((buffers["albedo"].shape[-2:], None if state is None else state["hidden0"].shape[-2:]))
+        return forward(buffers, state)
+
+    measured._step.model.forward = watched
+    measured.settle()
+    measured()
+    measured()
+    assert seen == [((64, 64), None), ((64, 64), (64, 64))] + [((80, 96), None)] + 2 * [((80, 96), (80, 96))]
+
+
 def test_megapixels_count_images_and_frames_of_sequences():
     assert subject("WSKP", batch=3).megapixels == pytest.approx(3 * 32 * 32 / 1e6)
     sequence = subject("NFOR", "frames=1", "features=normal")

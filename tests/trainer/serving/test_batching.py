@@ -106,6 +106,35 @@ def test_a_tile_is_taken_from_behind_others_of_another_shape():
     assert sizes[1:] == [(2, 3, 16, 16), (2, 3, 20, 20)]
 
 
+def test_each_tile_of_a_batch_gets_its_own_state_and_layers():
+    sizes = []
+    entered, gate = threading.Event(), threading.Event()
+
+    def net(buffers):
+        sizes.append(len(buffers["color"]))
+        entered.set()
+        gate.wait(60)
+        color = buffers["color"]
+        return Denoised(color, {"hidden": color[:, :1] + 10}, {"layer": color[:, :1] + 20})
+
+    batcher = Batcher(Batching(threads=1))
+    ticket = Ticket(time.monotonic() + 60)
+    with ThreadPoolExecutor(3) as pool:
+        pool.submit(batcher.run, ticket, net, {"color": torch.zeros(1, 3, 8, 8)})
+        assert entered.wait(60)
+        values = [torch.full((1, 3, 16, 16), float(v)) for v in (1, 2)]
+        waiting = [pool.submit(batcher.run, ticket, net, {"color": value}) for value in values]
+        wait_until(lambda: len(batcher._waiting) == 2)
+        gate.set()
+        made = [one.result() for one in waiting]
+    batcher.close()
+    assert sizes == [1, 2]
+    for result, value in zip(made, values, strict=True):
+        assert torch.equal(result.color, value)
+        assert torch.equal(result.state["hidden"], value[:, :1] + 10)
+        assert torch.equal(result.aux["layer"], value[:, :1] + 20)
+
+
 def test_large_tiles_are_not_joined_where_that_gains_nothing():
     sizes = []
     entered, gate = threading.Event(), threading.Event()
