@@ -23,7 +23,7 @@ from rich.table import Table
 MODULES = (
     *("training_step", "reconstruction", "loader", "preparation", "importance", "inference", "quality"),
     *("rendering", "procedural"),
-    *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "kp", "nbgd", "stills_quality"),
+    *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "kp", "nbgd", "realtime", "stills_quality"),
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
     *("nfor", "nfor_growth", "nlm", "classical_quality", "flicker"),
     *("scaling", "remote", "outage", "serve"),
