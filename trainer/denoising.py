@@ -183,7 +183,8 @@ class ClipDenoiser:
                 run=self.settings.run,
                 state=carried,
             )
-        self._state = denoised.state
+        if torch.isfinite(denoised.color).all():  # what is no number would spoil all later frames
+            self._state = denoised.state
         aux = {name: image[0] for name, image in (denoised.aux or {}).items()}
         return self.result(prepared, denoised.color[0], aux, self._attention(buffers))
 
