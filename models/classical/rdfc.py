@@ -159,6 +159,9 @@ class RDFC(Denoiser):
         self.second_pass = second_pass and halves.independent(own)
         self._set_kernels(second_window)
         self.halo = self._reach()
+        # Measured: growth of resident memory from 384x384 to 768x768, 0 and 7 channels of features; strips
+        # take up to `memory` beside that.
+        self.bytes_per_pixel = 470 + 72 * sum(buffer(name).channels for name in self.features)
 
     def _set_kernels(self, second_window: int | None) -> None:
         """Say how each filter makes its weights."""

@@ -271,6 +271,6 @@ def blended(distances: Tensor) -> Tensor:
     weights = torch.exp(-distances.clamp_min(0.0))
     both, mean = weights[:, :2], weights[:, 2:]
     total = both.sum(1, keepdim=True).clamp_min(math.exp(-NEAR))
-    near = (distances[:, :2] < NEAR).all(1, keepdim=True)
+    near = torch.maximum(distances[:, :1], distances[:, 1:2]) < NEAR
     share = torch.where(near, (mean / total - 1).clamp(0.0, 1.0), 0.0)
     return torch.lerp(both, mean, share)

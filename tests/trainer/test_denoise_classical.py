@@ -115,6 +115,17 @@ def test_layers_are_written_for_common_viewers(tmp_path: Path) -> None:
         assert sheet.width > 3 * 240
 
 
+def test_rdfc_writes_which_candidate_it_chose(tmp_path: Path) -> None:
+    source = write(tmp_path / "in" / "f000.exr", frame(*COLOR, *NORMAL))
+    narrow = ("features=normal", "window=2", "patches=0,1", "prefilter_window=1", "selection_window=1")
+    assert run(source, "--model", "RDFC", "--output", tmp_path / "out", "--aux", options=narrow) == 0
+    channels = read_exr(tmp_path / "out" / "f000_aux.exr").channels
+    shares = np.stack([channels[f"selection.{c}"] for c in "RGB"])
+    np.testing.assert_allclose(shares.sum(0), 1, atol=2e-3)
+    assert {name.split(".")[0] for name in channels} >= {"error_first", "error_second", "error_third"}
+    assert "normal.X" in channels
+
+
 def test_layers_are_not_written_unasked(tmp_path: Path) -> None:
     source = write(tmp_path / "in" / "f000.exr", frame(*COLOR, *NORMAL))
     assert nfor(source, tmp_path / "out", "--png") == 0
