@@ -30,7 +30,9 @@ Radiance, features and variances that are not finite count as 0. Distances are c
 `exposure`, since their small constant has the units of a variance.
 
 Published: 41 s and 349 MB per image on average over 21 scenes (table 2 of NFOR, doi:10.1111/cgf.12954, which
-has the authors' own comparison with it).
+has the authors' own comparison with it). Reached on the six stills that ship, at 32 samples per pixel:
+geometric mean of relMSE (exposed, epsilon 0.01) 0.0346, that of the input 0.133, of `JointNLM` 0.0554, of
+`NFOR` 0.0431. On one of them, indoor-000002, it is worse than both: 0.079, 0.034 and 0.044.
 """
 
 from __future__ import annotations
@@ -106,7 +108,7 @@ class RDFC(Denoiser):
             say; see `models.ops.symmetric.scaled_variance`.
         fireflies: `keep` them, or `limit` the halves of the colour by each other before anything else, see
             `models.ops.fireflies`; needs two halves.
-        aux: Return `selection` (the share of each candidate), `error_first`, `error_second`, `error_third`
+        aux: Return `shares` (of each candidate), `error_first`, `error_second`, `error_third`
             and each filtered feature by its name, normals within [-1, 1], albedo at most 1.
         memory: Working memory in bytes beside the buffers; none: 64 MB on a CPU, 4 GB on other devices.
     """
@@ -315,7 +317,7 @@ class RDFC(Denoiser):
 
     def _layers(self, mix: Selected, features: dict[str, FeatureMap], exposure: Tensor) -> dict[str, Tensor]:
         errors = (mix.errors / exposure.square()).split(1, 1)
-        layers = {"selection": mix.shares}
+        layers = {"shares": mix.shares}
         layers |= {f"error_{name}": error for name, error in zip(CANDIDATES, errors, strict=True)}
         for name, feature in features.items():
             layers[name] = 2 * feature.image - 1 if name == "normal" else feature.image

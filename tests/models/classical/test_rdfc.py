@@ -72,7 +72,7 @@ def test_the_result_its_errors_and_its_selection_equal_the_transcription(
     found = RDFC(**SMALL, guarded=guarded, aux=True)(doubled(buffers))
     assert found.aux is not None
     assert np.abs(as_rows(found.color) - expected.color).max() < 1e-10
-    assert np.abs(as_rows(found.aux["selection"]) - expected.shares).max() < 1e-10
+    assert np.abs(as_rows(found.aux["shares"]) - expected.shares).max() < 1e-10
     for i, name in enumerate(("first", "second", "third")):
         assert np.abs(as_rows(found.aux[f"error_{name}"])[..., 0] - expected.errors[..., i]).max() < 1e-10
     assert (expected.shares.max((0, 1)) > 0.2).all()  # each is chosen somewhere
@@ -186,7 +186,7 @@ def test_shadows_are_left_to_the_filters_that_see_colour_and_edges_of_features_t
         given, truth = scene(shadow)
         found = RDFC(("albedo",), feature_noise="none", window=5, aux=True)(given)
         assert found.aux is not None
-        shares.append(found.aux["selection"][..., 18:22].mean((0, 2, 3)))
+        shares.append(found.aux["shares"][..., 18:22].mean((0, 2, 3)))
         noisy = 0.5 * (given["color_a"] + given["color_b"])
         assert (found.color - truth).square().mean() < 0.1 * (noisy - truth).square().mean()
     assert shares[0][2] < 0.1

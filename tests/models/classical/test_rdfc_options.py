@@ -93,9 +93,9 @@ def test_layers_are_returned_when_asked_for(buffers: dict[str, Tensor]) -> None:
     assert RDFC(**SMALL)(buffers).aux is None
     found = RDFC(("normal", "albedo"), feature_noise="none", aux=True, **SMALL)(buffers).aux
     assert found is not None
-    assert set(found) == {"selection", "error_first", "error_second", "error_third", "normal", "albedo"}
+    assert set(found) == {"shares", "error_first", "error_second", "error_third", "normal", "albedo"}
     torch.testing.assert_close(found["normal"], buffers["normal"], rtol=0, atol=1e-6)
-    torch.testing.assert_close(found["selection"].sum(1), torch.ones(1, 20, 24))
+    torch.testing.assert_close(found["shares"].sum(1), torch.ones(1, 20, 24))
     assert found["error_third"].shape == (1, 1, 20, 24)
 
 
