@@ -61,23 +61,21 @@ def pair_filter(
     height, width = images.shape[-2:]
     pixels = _pixels(images, guide, kernel, features)
     sizes = [part.shape[1] for part in (*pixels[:-1], *pixels.t)]
-    joined = torch.cat([*pixels[:-1], *pixels.t], 1)
-    mirrored = mirrored_border(mirrored_border(joined, window, -1), window, -2)
+    mirrored = torch.cat([*pixels[:-1], *pixels.t], 1)
+    for axis in (-1, -2):
+        mirrored = mirrored_border(mirrored, window, axis)
     groups = [feature.image.shape[1] for feature in features] if kernel.taus else []
     if exporting():
         return _filtered(Pairs(mirrored, sizes, groups, kernel, step), 1.0)
     planes = sum(sizes) + 10 * sum(groups) + 60 + (images.shape[1] + 12) * len(kernel.rules)
-    found: list[Paired] = []
+    found = []
     for start, stop in strips(height, 4 * images.shape[0] * width * planes, budget, images.device):
         top, bottom = max(0, start - margin), min(height, stop + margin)
         pairs = Pairs(mirrored[..., top : bottom + 2 * window, :], sizes, groups, kernel, step)
-        strip = _filtered(pairs, (stop - start) / height)
         core = slice(start - top, stop - top)
-        found.append(Paired(*(None if part is None else part[..., core, :] for part in strip)))  # type: ignore[arg-type]
-    derivatives = [strip.derivative for strip in found if strip.derivative is not None]
-    return Paired(
-        torch.cat([strip.images for strip in found], -2), torch.cat(derivatives, -2) if derivatives else None
-    )
+        found.append([x[..., core, :] for x in _filtered(pairs, (stop - start) / height) if x is not None])
+    joined = [torch.cat(parts, -2) for parts in zip(*found, strict=True)]
+    return Paired(joined[0], joined[1] if step else None)
 
 
 def _pixels(images: Tensor, guide: Guide, kernel: PairKernel, features: Sequence[FeatureMap]) -> Pixels:
