@@ -12,6 +12,7 @@ from models.classical.joint_bilateral import JointBilateral
 from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
+from models.classical.rdfc import RDFC
 from models.classical.svgf import SVGF
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
@@ -36,6 +37,7 @@ __all__ = [
     "NFOR",
     "NLM",
     "RAE",
+    "RDFC",
     "SBMC",
     "SVGF",
     "WSKP",

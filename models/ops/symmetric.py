@@ -73,7 +73,7 @@ def symmetric_filter(
     window = kernel.patches.window
     height, width = image.shape[-2:]
     joined = torch.cat([image, guide.image, guide.variance * kernel.patches.scale], 1)
-    mirrored = _mirrored(_mirrored(joined, window, -1), window, -2)
+    mirrored = mirrored_border(mirrored_border(joined, window, -1), window, -2)
     margin = kernel.patches.patch + kernel.smoothing  # strips end in it as images do, and are cut to the core
     row_bytes = image.element_size() * image.shape[0] * width * 90
     if exporting():
@@ -96,7 +96,7 @@ def _filter(mirrored: Tensor, kernel: SymmetricKernel, share: float = 1.0) -> Te
         return mirrored[..., rows, window + right : window + right + width].chunk(3, 1)
 
     own, u, v = at(0, 0)
-    boxes = _Boxes(u)
+    boxes = Boxes(u)
     total, norm = own, torch.ones_like(own[:, :1])
     for down in range(window + 1):
         for right in range(-window if down else 1, window + 1):
@@ -135,7 +135,7 @@ def _blended(weights: Tensor) -> Tensor:
     return share * mean + (1 - share) * both
 
 
-class _Boxes:
+class Boxes:
     """Means over boxes that shrink at the border."""
 
     def __init__(self, like: Tensor) -> None:
@@ -160,7 +160,7 @@ class _Boxes:
         return box_sum_valid(F.pad(maps, [radius] * 4), 2 * radius + 1)
 
 
-def _mirrored(image: Tensor, pad: int, axis: int) -> Tensor:
+def mirrored_border(image: Tensor, pad: int, axis: int) -> Tensor:
     """Repeat an image mirrored at both ends of an axis, as often as the pad takes."""
     size = image.shape[axis]
     places = torch.arange(-pad, size + pad, device=image.device) % (2 * size)
@@ -181,7 +181,7 @@ def scaled_variance(variance: Tensor, a: Tensor, b: Tensor, radius: int = 10) ->
         b: Half B.
         radius: Of the box.
     """
-    boxes = _Boxes(variance)
+    boxes = Boxes(variance)
     return variance * boxes.mean(0.25 * (a - b).square(), radius) / (1e-10 + boxes.mean(variance, radius))
 
 

@@ -20,6 +20,7 @@ from tests.models.frames import split_buffers
 from trainer.commands import denoise as command
 from trainer.configs import UsageError
 from trainer.progress import FrameProgress
+from trainer.reports.layers import layer_sheet
 
 SMALL = ("window=2", "patch=1", "prefilter_window=1", "final_window=1")
 """Options of NFOR that make it quick."""
@@ -113,6 +114,32 @@ def test_layers_are_written_for_common_viewers(tmp_path: Path) -> None:
     assert selection.max() <= 1
     with Image.open(tmp_path / "out" / "f000_aux.png") as sheet:
         assert sheet.width > 3 * 240
+
+
+def test_rdfc_writes_which_candidate_it_chose(tmp_path: Path) -> None:
+    source = write(tmp_path / "in" / "f000.exr", frame(*COLOR, *NORMAL))
+    narrow = ("features=normal", "window=2", "patches=0,1", "prefilter_window=1", "selection_window=1")
+    assert run(source, "--model", "RDFC", "--output", tmp_path / "out", "--aux", "--png", options=narrow) == 0
+    channels = read_exr(tmp_path / "out" / "f000_aux.exr").channels
+    shares = np.stack([channels[f"shares.{c}"] for c in "RGB"])
+    np.testing.assert_allclose(shares.sum(0), 1, atol=2e-3)
+    assert {name.split(".")[0] for name in channels} >= {"error_first", "error_second", "error_third"}
+    assert "normal.X" in channels
+    with Image.open(tmp_path / "out" / "f000_aux.png") as sheet:
+        pixels = np.asarray(sheet.convert("RGB"), np.float32)
+    shown = np.abs(pixels.sum(-1) - 255) <= 2  # three shares of 255, whatever they are
+    assert shown.sum() > 240 * 200
+
+
+def test_shares_of_three_candidates_are_drawn_in_red_green_and_blue() -> None:
+    shares = np.zeros((20, 24, 3), np.float32)
+    shares[:10, :, 0], shares[10:, :12, 1], shares[10:, 12:, 2] = 1, 1, 1
+    errors = {f"error_{name}": np.ones((20, 24, 1), np.float32) for name in ("first", "second", "third")}
+    sheet = np.asarray(layer_sheet(np.ones((20, 24, 3), np.float32), 1.0, {"shares": shares, **errors}))
+    counts = [
+        int((sheet == np.array(color)).all(-1).sum()) for color in ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+    ]
+    assert counts[0] == 2 * counts[1] == 2 * counts[2] > 0
 
 
 def test_layers_are_not_written_unasked(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--aux",
         action="store_true",
-        help="also write what the method made on its way (NFOR: estimated errors, selection map, filtered "
+        help="also write what the method made on its way (NFOR, RDFC: estimated errors, selection, filtered "
         "features; Layer, Optimized: layers; WSKP: those of --weights) to NAME_aux.exr, and with --png a "
         "picture of it",
     )

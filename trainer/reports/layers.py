@@ -1,7 +1,8 @@
 """Sheet of what a method made on its way: estimated errors, selection map, filtered features.
 
 The selection map has the colours of figure 8 of Bitterli et al. 2016: red where the smaller bandwidth is
-used, green where the larger one is, and what lies between where they are mixed.
+used, green where the larger one is, and what lies between where they are mixed. Shares of three candidates
+have those of figure 3 there: red, green and blue.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from data.buffers import BUFFERS
 from trainer.reports.pictures import Array, Panel, false_color, font, grid, legend, sized, tone_map
 from trainer.reports.thumbnails import picture_of
 
-ERROR, SELECTION = "error_", "selection"
-"""How names of error maps begin, and the name of the selection map."""
+ERROR, SELECTION, SHARES = "error_", "selection", "shares"
+"""How names of error maps begin, and the names of the maps of which of two, and of three, was selected."""
 
 _SMALL, _LARGE = (0.85, 0.1, 0.1), (0.1, 0.72, 0.2)
 _COLUMNS = 3
@@ -30,7 +31,7 @@ def layer_sheet(color: Array, exposure: float, layers: Mapping[str, Array], labe
         color: The result, radiance (H, W, 3).
         exposure: Factor that brings radiance to a displayable level.
         layers: (H, W, C) each: `error_k0.5` and the like are squared errors in squared units of radiance,
-            `selection` is a share in [0, 1], others are buffers.
+            `selection` is a share in [0, 1], `shares` are three, others are buffers.
         label: Of the frame.
     """
     errors = {name: layer for name, layer in layers.items() if name.startswith(ERROR)}
@@ -39,9 +40,11 @@ def layer_sheet(color: Array, exposure: float, layers: Mapping[str, Array], labe
     rows = [[result]]
     if SELECTION in layers:
         rows[0] += _selection(layers[SELECTION], size, list(errors))
+    if SHARES in layers:
+        rows[0].append(_shares(layers[SHARES], list(errors)))
     if errors:
         rows.append(_errors(errors, exposure, size))
-    rest = [_panel(n, x, exposure) for n, x in layers.items() if n not in errors and n != SELECTION]
+    rest = [_panel(n, x, exposure) for n, x in layers.items() if n not in {*errors, SELECTION, SHARES}]
     rows += [rest[i : i + _COLUMNS] for i in range(0, len(rest), _COLUMNS)]
     return grid(rows, label)
 
@@ -59,6 +62,17 @@ def _selection(selection: Array, size: tuple[int, int], errors: list[str]) -> li
     share = float(np.clip(selection, 0, 1).mean())
     map_ = Panel(sized(selection_map(selection)), "selection", f"{large} has {share:.0%} of the weight")
     return [map_, Panel(_bar(size, (small, large)))]
+
+
+def _shares(shares: Array, errors: list[str]) -> Panel:
+    """Return the picture of three shares (H, W, 3) whose sum is 1."""
+    names = [name.removeprefix(ERROR) for name in errors] or ["first", "second", "third"]
+    means = shares.reshape(-1, 3).mean(0)
+    colors = zip(("red", "green", "blue"), names, means, strict=True)
+    picture = Image.fromarray(np.rint(255 * np.clip(shares, 0, 1)).astype(np.uint8))
+    return Panel(
+        sized(picture), SHARES, ", ".join(f"{name} {mean:.0%} {color}" for color, name, mean in colors)
+    )
 
 
 def _bar(size: tuple[int, int], ends: tuple[str, str]) -> Image.Image:
