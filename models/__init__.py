@@ -11,6 +11,7 @@ from models.classical.joint_bilateral import JointBilateral
 from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
+from models.classical.rhf import RHF
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
@@ -33,6 +34,7 @@ __all__ = [
     "NFOR",
     "NLM",
     "RAE",
+    "RHF",
     "SBMC",
     "WSKP",
     "CrossBilateral",
