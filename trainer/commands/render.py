@@ -88,6 +88,11 @@ def _image_arguments(group: Any) -> None:
     group.add_argument(
         "--spp", type=int, nargs="+", help="samples per pixel of the noisy images; stills: several"
     )
+    group.add_argument(
+        "--histogram",
+        action="store_true",
+        help="stills also have the histogram of each pixel's samples, which RHF reads: 60 more channels",
+    )
     group.add_argument("--reference-spp", type=int, help="samples per pixel of the reference")
     group.add_argument("--max-depth", type=int, help="longest path in segments (default 8)")
     group.add_argument(
@@ -210,6 +215,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         reference_spp=args.reference_spp,
         max_depth=args.max_depth,
         chunk=chunk,
+        histogram=args.histogram,
     )
 
 
