@@ -12,7 +12,10 @@ In the released tool the number of samples of a coarser scale is kept for the wh
 neighbourhood: the same where all pixels have equally many samples, and independent of how an image is cut.
 
 Bins count where two pixels have more than one sample in them together. With one or two samples per pixel
-hardly any do, and nearly everything is accepted: the method wants eight or more.
+hardly any do, and nearly everything is accepted. With 8 a patch that differs in one corner is still accepted,
+since the few bins of one pixel are averaged with those of eight others; where that pixel is a lamp its light
+spreads over the window. The distance of different patches grows with the samples: the method wants 16 or
+more.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from torch import Tensor
 from data.buffers import HISTOGRAM
 from data.histograms import HISTOGRAM_MADE
 from models.denoiser import Buffers, Denoised, Denoiser
-from models.ops.histogram import HistogramKernel, coarser_histogram, histogram_filter
+from models.ops.histogram import coarser_histogram, histogram_filter
+from models.ops.histogram_distance import HistogramKernel
 from models.ops.nlm import UNROLLED
 from models.ops.pyramid import coarser, merged, reach
 
@@ -39,11 +43,13 @@ class RHF(Denoiser):
         nearest: How many of the nearest patches are averaged at the finest scale whatever their distance,
             beside the patch itself.
         memory: Working memory in bytes beside the buffers; none: 64 MB on a CPU, 4 GB on other devices.
+        fused: Whether compiled loops take over, None: where possible; see `models.ops.nlm.use_fused`.
     """
 
     inputs = ("color", HISTOGRAM)
     no_export = UNROLLED
-    bytes_per_pixel = 1500
+    bytes_per_pixel = 1400
+    bytes_once = 64_000_000
 
     def __init__(
         self,
@@ -54,13 +60,15 @@ class RHF(Denoiser):
         *,
         nearest: int = 2,
         memory: int | None = None,
+        fused: bool | None = None,
     ) -> None:
         super().__init__()
         if scales < 1:
             raise ValueError(f"RHF: scales must be at least 1, got {scales}")
         self.kernel = HistogramKernel(window, patch, threshold, nearest)
         self.coarse_kernel = HistogramKernel(window, patch, threshold, 0)
-        self.scales, self.multiple, self.memory = scales, 2 ** (scales - 1), memory
+        self.scales, self.multiple = scales, 2 ** (scales - 1)
+        self.memory, self.fused = memory, fused
         self.halo = reach(self.kernel.reach, scales)
 
     def forward(self, buffers: Buffers) -> Denoised:
@@ -86,7 +94,7 @@ class RHF(Denoiser):
             raise ValueError(f"{error}. {HISTOGRAM_MADE}") from None
 
     def _scale(self, color: Tensor, histogram: Tensor, scales: int, kernel: HistogramKernel) -> Tensor:
-        fine = histogram_filter(color, histogram, kernel, self.memory)
+        fine = histogram_filter(color, histogram, kernel, self.memory, fused=self.fused)
         if scales == 1:
             return fine
         smaller = coarser(color), coarser_histogram(histogram)

@@ -25,7 +25,8 @@ Makes a data set that `trainer prepare` and `trainer fit` take, with references,
 files. Interrupted, the same command goes on; with a larger --reference-spp it refines what is there.
 
   stills      for AFGSA, ACFM, KPCN, NFOR: diffuse and specular light, guides, two half buffers and the
-              variance of the mean of every buffer, at several samples per pixel of the same stream
+              variance of the mean of every buffer, at several samples per pixel of the same stream;
+              with --histogram for RHF too
   sequences   for WSKP, BMFR, SVGF: 1 sample per pixel, positions, motion vectors, a moving camera
   samples     for layer embeddings, sample splatting: every sample apart, with 20 numbers
 """

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from models import RHF
 from models.denoiser import Buffers
-from models.ops.histogram import HistogramKernel, coarser_histogram, histogram_filter, sample_histogram
+from models.ops.histogram import coarser_histogram, histogram_filter, sample_histogram
+from models.ops.histogram_distance import HistogramKernel
 from models.ops.pyramid import coarser
 from tests.models import plain_rhf
 from tests.models.frames import largest_relative
@@ -47,11 +48,13 @@ def plain(buffers: Buffers, *options: float) -> plain_rhf.Array:
 def test_the_result_is_the_literal_formula(options: tuple[int, int, int, float, int]) -> None:
     buffers = buffers_of(noisy(13, 11))
     scales, window, patch, threshold, nearest = options
-    denoiser = RHF(scales, window, patch, threshold, nearest=nearest)
     expected = plain(buffers, *options)
-    assert np.abs(rows_of(denoiser(buffers).color) - expected).max() < 1e-12
+    exact = RHF(scales, window, patch, threshold, nearest=nearest)
+    assert np.abs(rows_of(exact(buffers).color) - expected).max() < 1e-12
     single = {name: image.float() for name, image in buffers.items()}
-    assert np.abs(rows_of(denoiser(single).color) - expected).max() < 1e-5
+    for fused in (False, True):
+        denoiser = RHF(scales, window, patch, threshold, nearest=nearest, fused=fused)
+        assert np.abs(rows_of(denoiser(single).color) - expected).max() < 1e-5
     assert np.abs(expected - rows_of(buffers["color"])).max() > 0.1
 
 
@@ -111,11 +114,12 @@ def test_a_smaller_threshold_keeps_more_noise_and_two_scales_leave_less_of_low_f
     assert left[2, 6, 1, 0.8] < left[1, 6, 1, 0.8] < 0.5 * left[1, 6, 1, 0.4]
 
 
-def test_strips_of_any_height_give_the_same_bits() -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_strips_of_any_height_give_the_same_bits(fused: bool) -> None:
     buffers = {name: image.float() for name, image in buffers_of(noisy(40, 21)).items()}
-    whole = RHF()(buffers).color
+    whole = RHF(fused=fused)(buffers).color
     for memory in (1, 300_000):
-        assert torch.equal(RHF(memory=memory)(buffers).color, whole)
+        assert torch.equal(RHF(memory=memory, fused=fused)(buffers).color, whole)
 
 
 def test_a_coarser_histogram_holds_the_samples_of_four_pixels_and_the_shares_of_the_low_pass() -> None:
