@@ -14,8 +14,7 @@ neighbourhood: the same where all pixels have equally many samples, and independ
 Bins count where two pixels have more than one sample in them together. With one or two samples per pixel
 hardly any do, and nearly everything is accepted. With 8 a patch that differs in one corner is still accepted,
 since the few bins of one pixel are averaged with those of eight others; where that pixel is a lamp its light
-spreads over the window. The distance of different patches grows with the samples: the method wants 16 or
-more.
+spreads over the window. The distance of different patches grows with the number of samples.
 """
 
 from __future__ import annotations
