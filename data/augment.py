@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import buffer
+from data.buffers import HISTOGRAM, buffer
 
 Rule = Literal["wskp", "dihedral", "none"]
 Array = NDArray[np.float32]
@@ -203,6 +203,8 @@ def reordered(image: Array, name: str, change: Change) -> Array:
         return image[list(change.axes)]
     if change.colors != ORDERS[0] and buffer(name).letters == "RGB":
         return image[list(change.colors)]
+    if change.colors != ORDERS[0] and name == HISTOGRAM:
+        return image.reshape(3, -1, *image.shape[1:])[list(change.colors)].reshape(image.shape)
     return image
 
 

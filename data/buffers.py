@@ -20,7 +20,7 @@ class Buffer:
     Attributes:
         name: The word used everywhere: in batches, shards, exported artifacts and our own EXR files.
         channels: Number of channels, or 0 where a list of channels describes the buffer (`samples`).
-        letters: EXR channel letters in the order of the array's channels.
+        letters: EXR channel letters, or names, in the order of the array's channels.
         kind: `radiance` scales with exposure, `vector` turns with the image if it lives in the image plane.
         unit: Unit of the stored value.
         low: Smallest legal value (None: unbounded).
@@ -33,7 +33,7 @@ class Buffer:
 
     name: str
     channels: int
-    letters: str
+    letters: str | tuple[str, ...]
     kind: Kind
     unit: str
     low: float | None
@@ -47,6 +47,12 @@ class Buffer:
 def _radiance(name: str, meaning: str) -> Buffer:
     return Buffer(name, 3, "RGB", "radiance", "linear radiance", 0.0, None, 0.0, True, "neighbours", meaning)
 
+
+HISTOGRAM = "histogram"
+"""Name of the buffer with the histograms of the samples of each pixel."""
+
+HISTOGRAM_BINS = 20
+"""Bins of each colour channel."""
 
 _PLAIN = (
     _radiance("color", "Noisy radiance, with albedo."),
@@ -203,6 +209,19 @@ _PLAIN = (
         "no_hit",
         "Number of frames accumulated in `irradiance`.",
     ),
+    Buffer(
+        HISTOGRAM,
+        3 * HISTOGRAM_BINS,
+        tuple(f"{color}{place:02d}" for color in "RGB" for place in range(HISTOGRAM_BINS)),
+        "count",
+        "samples",
+        0.0,
+        None,
+        0.0,
+        False,
+        "no_hit",
+        "How many of the pixel's samples lie in each of 20 bins, of red, green and blue.",
+    ),
 )
 
 
@@ -225,7 +244,7 @@ def _derived(buffer: Buffer) -> tuple[Buffer, ...]:
     return (*halves, variance)
 
 
-_SINGLE = ("reference", "reference_diffuse", "history", "hit")
+_SINGLE = ("reference", "reference_diffuse", "history", "hit", HISTOGRAM)
 """Buffers without halves and variance."""
 
 BUFFERS: dict[str, Buffer] = {b.name: b for b in _PLAIN}

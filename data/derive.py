@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data import camera as cameras
-from data.buffers import BUFFERS
+from data.buffers import BUFFERS, HISTOGRAM
 from data.camera import Camera, DepthKind
-from data.frame import Frame, Image
+from data.dropped import mean as mean_of_samples
+from data.frame import Frame, Image, Samples
+from data.histograms import HISTOGRAM_MADE, sample_histogram
 
 ALBEDO_FLOOR = 0.01
 """Smallest effective albedo per channel. Division by it raises radiance at most a hundredfold, which keeps
@@ -97,8 +99,8 @@ def derive(
     albedo, its halves and variance from diffuse_albedo and specular_albedo; irradiance = color / albedo;
     color = diffuse + specular, or irradiance * albedo; specular = color - diffuse and the reverse; depth from
     position and camera; motion from position and both cameras; hit from depth; history 1 for frames that are
-    not accumulated. Any buffer is the mean of its halves of equal size, and either half is twice the mean
-    less the other.
+    not accumulated; histogram from samples that are kept apart, exposed. Any buffer is the mean of its halves
+    of equal size, and either half is twice the mean less the other.
     `notes["derived"]` of the result records each with its rule.
 
     Args:
@@ -136,7 +138,9 @@ def obtainable(
         previous: As for `derive`.
     """
     pixels = {name: np.ones((1, 1, array.shape[2]), np.float32) for name, array in frame.buffers.items()}
-    pixel = replace(frame, buffers=pixels, samples=None, notes={})
+    kept = frame.samples
+    first = None if kept is None else Samples(kept.values[:1, :1, :1], kept.channels)
+    pixel = replace(frame, buffers=pixels, samples=first, notes={})
     found = set()
     for name in names:
         with suppress(ValueError):
@@ -212,6 +216,7 @@ class _Context:
             **{f"specular_{h}": partial(self._rest_of_half, "specular", "diffuse", h) for h in "ab"},
             "hit": self._hit,
             "history": self._history,
+            HISTOGRAM: self._histogram,
         }
 
     def need(self, name: str) -> Image:
@@ -324,6 +329,14 @@ class _Context:
         if self.frame.accumulated:
             raise self._fail("history", "the count of accumulated frames")
         return np.ones((self.frame.height, self.frame.width, 1), np.float32), "1, not accumulated"
+
+    def _histogram(self) -> tuple[Image, str]:
+        samples = self.frame.samples
+        if samples is None or "radiance" not in samples.names:
+            raise ValueError(f"{self._fail(HISTOGRAM, 'the radiance of each sample')}; {HISTOGRAM_MADE}")
+        radiance = samples.get("radiance")
+        exposure = self.frame.exposure or automatic_exposure(np.nan_to_num(mean_of_samples(radiance)))
+        return sample_histogram(radiance, exposure), f"samples times exposure {exposure:.6g}"
 
 
 def _distance(position: Image, centre: NDArray[np.float64]) -> Image:

@@ -370,10 +370,14 @@ def _by_file_name(path: Path, layers: Mapping[str, Any]) -> str:
 
 def _ordered(path: Path, name: str, letters: Mapping[str, str]) -> list[str] | None:
     count = buffer(name).channels
-    for order in _LETTERS[count]:
+    for order in (*_LETTERS.get(count, ()), buffer(name).letters):
         if all(letter in letters for letter in order):
             return [letters[letter] for letter in order]
-    if name.endswith("_variance") or (count == 3 and not {"R", "G", "B", "X"} & letters.keys()):
+    if (
+        name.endswith("_variance")
+        or count not in _LETTERS
+        or (count == 3 and not {"R", "G", "B", "X"} & letters.keys())
+    ):
         return None
     if count == 1 and letters:
         return [next(iter(letters.values()))]

@@ -13,6 +13,7 @@ from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
 from models.classical.rdfc import RDFC
+from models.classical.rhf import RHF
 from models.classical.svgf import SVGF
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
@@ -38,6 +39,7 @@ __all__ = [
     "NLM",
     "RAE",
     "RDFC",
+    "RHF",
     "SBMC",
     "SVGF",
     "WSKP",

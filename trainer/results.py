@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -114,7 +114,7 @@ def write_aux(path: Path, result: Result) -> None:
     write_exr(path, channels, {"comments": f"{result.frame.label}: {', '.join(result.aux)}"})
 
 
-def _letters(name: str, image: Image) -> str:
+def _letters(name: str, image: Image) -> Sequence[str]:
     if name in BUFFERS:
         return BUFFERS[name].letters
     return {1: "Y", 2: "XY"}.get(image.shape[2], "RGB")

@@ -8,9 +8,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from data.buffers import HISTOGRAM
 from data.camera import Camera
+from data.derive import automatic_exposure
 from data.frame import Frame, Image, Samples
 from data.render.moments import Moments, at_counts, over_hits
+from data.render.ray_histograms import RayHistograms
 from data.render.recipe import Recipe
 from data.render.spec import SceneSpec
 
@@ -109,13 +112,35 @@ def noisy_frames(
         frame.samples = samples
         yield frame
         return
-    stream = ((chunk.rows, _with_specular(chunk.values)) for chunk in chunks)
+    histograms = _histograms(tracer, view, recipe, seed) if recipe.histogram else None
+    stream = ((chunk.rows, _with_specular(chunk.values)) for chunk in _counted(chunks, histograms))
     for level, (count, moments) in enumerate(at_counts(stream, recipe.spp, (recipe.height, recipe.width))):
         buffers = _still(moments) if recipe.kind == "stills" else _means(moments)
         frame = _frame(tracer, view, view * len(recipe.spp) + level, count, buffers)
         if len(recipe.spp) > 1 or not spec.path:
             frame.notes["view"] = view
+        if histograms is not None:
+            frame.buffers[HISTOGRAM] = histograms.take(count)
+            frame.notes["checks"] = {"histogram_exposure": histograms.exposure}
         yield frame
+
+
+def _histograms(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> RayHistograms:
+    """Return histograms to fill, exposed as one sample per pixel says that is traced before the others."""
+    image = np.zeros((recipe.height, recipe.width, 3), np.float32)
+    before = tracer.invalid
+    for chunk in tracer.trace(view, 1, seed ^ 1, ("radiance",)):
+        image[chunk.rows] = chunk.values["radiance"][0]
+    tracer.invalid = before
+    return RayHistograms(recipe.spp, image.shape[:2], automatic_exposure(image))
+
+
+def _counted(chunks: Iterator[Any], histograms: RayHistograms | None) -> Iterator[Any]:
+    """Yield chunks, and add their samples to histograms before."""
+    for chunk in chunks:
+        if histograms is not None:
+            histograms.add(chunk.rows, chunk.values["radiance"])
+        yield chunk
 
 
 def noisy_color(frame: Frame) -> Image:

@@ -65,6 +65,7 @@ class Recipe:
         reference_spp: Samples per pixel of the reference.
         max_depth: Longest path, in segments.
         chunk: Samples traced at once. Larger ones need more memory: about 1 kB per sample.
+        histogram: `stills` also have the histogram of each pixel's samples.
     """
 
     kind: Kind
@@ -74,6 +75,7 @@ class Recipe:
     reference_spp: int
     max_depth: int = 8
     chunk: int = 2**20
+    histogram: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -92,6 +94,9 @@ class Recipe:
             raise ValueError(f"--spp {odd}: stills have two half buffers, so the numbers must be even")
         if self.kind != "stills" and len(self.spp) > 1:
             raise ValueError(f"--spp: {self.kind} take one number")
+        if self.histogram and self.kind != "stills":
+            follows = ": their histograms follow from their samples" if self.kind == "samples" else ""
+            raise ValueError(f"--histogram is for stills, not {self.kind}{follows}; leave it out")
         if self.reference_spp < 2:
             raise ValueError(f"--reference-spp {self.reference_spp}: expected at least 2")
         if self.max_depth < 2:
@@ -124,13 +129,17 @@ class Recipe:
         return self.pixels * (self.spp[-1] + self.reference_spp)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for the manifest."""
-        return {**asdict(self), "spp": list(self.spp), "version": RECIPE_VERSION}
+        """Return plain data for the manifest; without histograms it is what it was before there were any."""
+        values = {**asdict(self), "spp": list(self.spp), "version": RECIPE_VERSION}
+        if not self.histogram:
+            del values["histogram"]
+        return values
 
     def same_work(self, other: dict[str, Any]) -> bool:
         """Return whether a manifest's recipe is this one but for the samples of the reference."""
         mine = {**self.to_json(), "reference_spp": other.get("reference_spp")}
-        return all(other.get(name) == value for name, value in mine.items())
+        same = bool(other.get("histogram")) == self.histogram
+        return same and all(other.get(name) == value for name, value in mine.items())
 
 
 def defaults(kind: Kind) -> Recipe:

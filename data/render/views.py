@@ -137,6 +137,7 @@ def _finished(work: ViewWork, record: FrameRecord, reference: Reference) -> Fram
         "view": record.view,
         "reference_spp": reference.count,
         "checks": {
+            **record.checks,
             "energy_z": round(energy_z(noisy_color(frame), spp, reference), 3),
             "reference_relmse": float(f"{reference.relative_error(exposure):.4g}"),
             "invalid_samples": float(reference.invalid),

@@ -30,7 +30,7 @@ from models.ops import halves
 from models.ops.fireflies import KEPT, Fireflies, checked, limited_halves
 from models.ops.halves import ColorNoise, Halves
 from models.ops.nlm import UNROLLED, Guide, PatchKernel, nlm_filter
-from models.ops.pyramid import LOW_PASS, coarser, coarser_variance, finer
+from models.ops.pyramid import coarser, coarser_variance, merged, reach
 from models.ops.symmetric import SymmetricKernel, residual_error, scaled_variance, symmetric_filter
 
 Preset = Literal["plain", "rkz12"]
@@ -245,15 +245,7 @@ class MultiScaleNLM(NLM):
         if scales < 1:
             raise ValueError(f"MultiScaleNLM: scales must be at least 1, got {scales}")
         self.scales, self.multiple = scales, 2 ** (scales - 1)
-        self.halo = self._reach(scales) + self._color_reach()
-
-    def _reach(self, scales: int) -> int:
-        """Return how far a core of `multiple` pixels looks: its filter, or through the coarser scales."""
-        if scales == 1:
-            return self._filter_reach()
-        side = len(LOW_PASS) // 2 - 1  # down-sampling adds this, up-sampling two coarse pixels
-        through = 2 * (max(self._reach(scales - 1), 0) + 2) + side
-        return max(self._filter_reach() + 4 + side, through)
+        self.halo = reach(self._filter_reach(), scales) + self._color_reach()
 
     def _halves(self, color: Halves, buffers: Buffers) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         height, width = color.a.shape[-2:]
@@ -269,5 +261,5 @@ class MultiScaleNLM(NLM):
             return fine
         smaller = Halves(coarser(color.a), coarser(color.b), coarser_variance(color.variance))
         coarse = self._scale(smaller, scales - 1)
-        first, second = (x + finer(y - coarser(x)) for x, y in zip(fine, coarse, strict=True))
+        first, second = (merged(x, y) for x, y in zip(fine, coarse, strict=True))
         return first, second

@@ -34,6 +34,20 @@ def finer(image: Tensor) -> Tensor:
     return F.interpolate(image, scale_factor=2, mode="bicubic", align_corners=False)
 
 
+def merged(fine: Tensor, coarse: Tensor) -> Tensor:
+    """Return a filtered image whose low frequencies are those of the filtered coarser one."""
+    return fine + finer(coarse - coarser(fine))
+
+
+def reach(filter_reach: int, scales: int) -> int:
+    """Return how far a core of 2^(scales - 1) pixels looks: its filter, or through the coarser scales."""
+    if scales == 1:
+        return filter_reach
+    side = len(LOW_PASS) // 2 - 1  # down-sampling adds this, up-sampling two coarse pixels
+    through = 2 * (max(reach(filter_reach, scales - 1), 0) + 2) + side
+    return max(filter_reach + 4 + side, through)
+
+
 def _down(image: Tensor, taps: list[float]) -> Tensor:
     margin = len(taps) // 2 - 1
     result = F.pad(image, [margin] * 4, mode="replicate")

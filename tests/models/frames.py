@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from models.ops.histogram import sample_histogram
+
 
 def random_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
     """Return irradiance, albedo, normal and depth of a random surface with noisy light."""
@@ -45,7 +47,7 @@ def noisy_edges(batch: int, height: int, width: int, seed: int = 0) -> tuple[dic
 
 
 def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
-    """Return those and color, its diffuse and specular parts, references, halves and variances."""
+    """Return those and color, its diffuse and specular parts, references, halves, variances, a histogram."""
     buffers = lit(random_buffers(batch, height, width, seed))
     generator = torch.Generator().manual_seed(seed + 1000)
     for name in ("color", "diffuse", "specular", "albedo", "normal", "depth"):
@@ -56,6 +58,8 @@ def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[st
         buffers[f"{name}_a"], buffers[f"{name}_b"] = buffers[name] + shift, buffers[name] - shift
     for name, source in (("reference", "color"), ("reference_diffuse", "diffuse")):
         buffers[name] = torch.nn.functional.avg_pool2d(buffers[source], 5, 1, 2)
+    light = -torch.log1p(-torch.rand(batch, 8, 3, height, width, generator=generator))
+    buffers["histogram"] = sample_histogram(buffers["color"][:, None] * light)
     return buffers
 
 

@@ -12,11 +12,12 @@ import torch
 from PIL import Image
 
 import trainer.loading
+from data.derive import derive
 from data.exr import read_frame
 from data.exr_image import read_exr, write_exr
 from data.frame import Frame, Samples
 from data.root import resolve_root
-from models import NLM, Layer, PixelGather
+from models import NLM, RHF, Layer, PixelGather
 from models.denoiser import select
 from models.ops.per_sample import sample_counts
 from models.tiling import denoise_in_tiles
@@ -210,3 +211,24 @@ def test_constants_for_what_is_not_read_or_no_numbers_are_refused(text: str, mat
 def test_nothing_is_filled_for_models_that_read_no_samples() -> None:
     with pytest.raises(UsageError, match="reads no samples"):
         fill(NLM(), ["lens=0"])
+
+
+def test_ray_histogram_fusion_reads_histograms_that_follow_from_the_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = RHF(window=2)
+    assert denoise(monkeypatch, model, tmp_path) == 0
+    frame = derive(read_frame(FRAME), model.inputs)
+    tensors = {n: torch.from_numpy(frame.buffers[n].transpose(2, 0, 1).copy())[None] for n in model.inputs}
+    with torch.no_grad():
+        expected = model(tensors).color[0].permute(1, 2, 0).numpy()
+    found = read_frame(tmp_path / "f000.exr").buffers["color"]
+    assert np.abs(found - expected).max() <= 1e-3 * np.abs(expected).max()
+
+
+def test_a_frame_without_samples_and_histograms_is_refused_with_the_commands_that_make_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = resolve_root("sample:stills").path / "indoor-000002" / "f000.exr"
+    with pytest.raises(ValueError, match=r"missing buffer 'histogram'.*trainer render stills --histogram"):
+        denoise(monkeypatch, RHF(), tmp_path, frame=still)

@@ -162,6 +162,13 @@ def test_wrong_options_are_named_before_anything_is_rendered(tmp_path, monkeypat
     assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.parametrize("kind", ["sequences", "samples"])
+def test_histograms_are_for_stills(tmp_path, monkeypatch, capsys, kind):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, ["render", kind, "--random", "1", "--output", "set", "--histogram"]) == 2
+    assert f"--histogram is for stills, not {kind}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [

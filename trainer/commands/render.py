@@ -25,7 +25,8 @@ Makes a data set that `trainer prepare` and `trainer fit` take, with references,
 files. Interrupted, the same command goes on; with a larger --reference-spp it refines what is there.
 
   stills      for AFGSA, ACFM, KPCN, NFOR: diffuse and specular light, guides, two half buffers and the
-              variance of the mean of every buffer, at several samples per pixel of the same stream
+              variance of the mean of every buffer, at several samples per pixel of the same stream;
+              with --histogram for RHF too
   sequences   for WSKP, BMFR, SVGF: 1 sample per pixel, positions, motion vectors, a moving camera
   samples     for layer embeddings, sample splatting: every sample apart, with 20 numbers
 """
@@ -87,6 +88,11 @@ def _image_arguments(group: Any) -> None:
     group.add_argument("--size", metavar="WxH", help="columns and rows, such as 1280x720")
     group.add_argument(
         "--spp", type=int, nargs="+", help="samples per pixel of the noisy images; stills: several"
+    )
+    group.add_argument(
+        "--histogram",
+        action="store_true",
+        help="stills also have the histogram of each pixel's samples, which RHF reads: 60 more channels",
     )
     group.add_argument("--reference-spp", type=int, help="samples per pixel of the reference")
     group.add_argument("--max-depth", type=int, help="longest path in segments (default 8)")
@@ -210,6 +216,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         reference_spp=args.reference_spp,
         max_depth=args.max_depth,
         chunk=chunk,
+        histogram=args.histogram,
     )
 
 

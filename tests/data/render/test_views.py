@@ -6,6 +6,7 @@ import pytest
 
 from data.derive import derive
 from data.exr import read_frame
+from data.histograms import sample_histogram
 from data.manifest import FrameRecord
 from data.render.frames import noisy_frames
 from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
@@ -242,3 +243,44 @@ def test_specular_light_has_its_own_variance_and_follows_from_the_rest(tmp_path)
     expected = frame.buffers["color_variance"].mean() + frame.buffers["diffuse_variance"].mean()
     assert frame.buffers["specular_variance"].mean() == pytest.approx(expected, rel=0.05)
     assert "specular_albedo_variance" in frame.buffers
+
+
+WITH_HISTOGRAMS = with_options(STILLS, spp=(2, 6, 8), histogram=True)
+
+
+@pytest.mark.parametrize("chunk", [384, 1024, 2**14])
+def test_histograms_hold_the_first_samples_of_each_pixel_however_they_arrive(tmp_path, chunk):
+    tracer = FakeTracer(chunk=chunk)
+    seed = seed_of("k", "input")
+    chunks = list(FakeTracer(chunk=chunk).trace(0, 8, seed, WITH_HISTOGRAMS.names))
+    bands = {part.rows.start: [] for part in chunks}
+    for part in chunks:
+        bands[part.rows.start].append(part.values["radiance"])
+    samples = np.concatenate([np.concatenate(bands[top]) for top in sorted(bands)], 1)
+    done = work(tmp_path, WITH_HISTOGRAMS)
+    render(done, tracer)
+    assert [(spp, s == seed) for _, spp, s in tracer.calls[:2]] == [(1, False), (8, True)]
+    for record, spp in zip(records(done), (2, 6, 8), strict=True):
+        found = read_frame(tmp_path / record.file).buffers["histogram"]
+        expected = sample_histogram(samples[:spp], record.checks["histogram_exposure"])
+        assert np.allclose(found, expected, atol=1e-5)
+
+
+def test_the_exposure_of_histograms_follows_the_brightness_of_the_scene(tmp_path):
+    exposures = []
+    for scale in (1.0, 50.0):
+        done = work(tmp_path / str(scale), WITH_HISTOGRAMS)
+        render(done, FakeTracer(scale=scale))
+        exposures.append(records(done)[-1].checks["histogram_exposure"])
+    assert exposures[0] == pytest.approx(50 * exposures[1], rel=1e-4)
+
+
+def test_without_histograms_a_recipe_is_what_it_was_and_with_them_another():
+    assert "histogram" not in STILLS.to_json()
+    asked = with_options(STILLS, histogram=True)
+    assert view_key({}, 0, asked) != view_key({}, 0, STILLS)
+    assert asked.same_work(with_options(asked, reference_spp=128).to_json())
+    assert not asked.same_work(STILLS.to_json())
+    assert not STILLS.same_work(asked.to_json())
+    with pytest.raises(ValueError, match="--histogram is for stills, not samples: their histograms follow"):
+        with_options(defaults("samples"), histogram=True)
