@@ -9,6 +9,22 @@ its own for each. Multiply-adds are those of the convolutions. RAE stands for ON
 sequence, which costs what the others cost; nothing of it is a reconstruction.
 
 "paper" is the published ratio or time, on an RTX 2080 Ti with operators written in CUDA (ONND: Titan X).
+
+Where the order differs from the paper's, and why, as measured at 640x368 on two cores that had other work
+too (quotients to WSKP with six layers; those of filters move by half with the load):
+- WSKP's filter visits the 454 taps of six kernels in the paper, and KP's with 169 costs about the same. Here
+  WSKP needs no taps but box sums, at most ten additions per channel and kernel, while KP takes an exponential
+  for each tap: seven to ten times as long, so KP takes 3.4 to 4.5 times WSKP's time (paper 2.16);
+- NBGD with two layers takes 2.1 to 2.2 times WSKP's time (paper 1.08), with a quarter of its multiply-adds:
+  a pixel is added to eight cells of each of three grids and reads as many, by index, which is three quarters
+  of the time. The second core halves WSKP's convolutions and takes a quarter off the grids: in one thread the
+  quotient is 1.6;
+- KP's network takes about three times WSKP's time, as its multiply-adds say; in the paper 2.2 times;
+- the U-Nets take more than theirs say, MR-WSKP over twice the prediction for 31 to 27 thousand a pixel (paper
+  1.9): a fifth of its time in one thread only pools and joins maps of 48 and 96 channels;
+- KP takes 2.1 to 2.3 times WSKP's memory (paper 3.16), since its logits exist for some rows at a time.
+
+    python -m tests.benchmarks realtime
 """
 
 from __future__ import annotations
