@@ -13,6 +13,7 @@ from models.classical.joint_nlm import JointNLM
 from models.classical.nfor import NFOR
 from models.classical.nlm import NLM, MultiScaleNLM
 from models.classical.svgf import SVGF
+from models.classical.wlr import WLR
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
@@ -38,6 +39,7 @@ __all__ = [
     "RAE",
     "SBMC",
     "SVGF",
+    "WLR",
     "WSKP",
     "CrossBilateral",
     "JointBilateral",
