@@ -147,7 +147,7 @@ def _pixels(stack: Stack, device: torch.device, budget: float | None) -> int:
     if budget is None:
         budget = _BUDGET.get(device.type, _BUDGET_ELSEWHERE)
     # Copies of a window: features, colours, coordinates, squares, regressors, the same weighted, weights.
-    numbers = (2 * stack.window + 1) ** 2 * (9 * stack.dimensions + 30)
+    numbers = (2 * stack.window + 1) ** 2 * (13 * stack.dimensions + 40)
     return max(1, int(budget / (8 * numbers * stack.size[0])))
 
 
