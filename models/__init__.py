@@ -15,6 +15,7 @@ from models.classical.nlm import NLM, MultiScaleNLM
 from models.classical.rdfc import RDFC
 from models.classical.rhf import RHF
 from models.classical.svgf import SVGF
+from models.classical.wlr import WLR
 from models.denoiser import Denoised as Denoised
 from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
@@ -42,6 +43,7 @@ __all__ = [
     "RHF",
     "SBMC",
     "SVGF",
+    "WLR",
     "WSKP",
     "CrossBilateral",
     "JointBilateral",

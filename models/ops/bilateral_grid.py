@@ -221,7 +221,8 @@ def _gather(
         sums = flat.new_zeros(2, channels * (1 + counted), *piece.depths[0].shape[1:])
         for index, area in piece.taps:
             for upper, some in enumerate(sums):
-                values = flat[:, upper:].index_select(1, index).view_as(some[:channels])
+                # Selecting from `flat[:, upper:]` would copy the whole grid first.
+                values = flat.index_select(1, index + upper if upper else index).view_as(some[:channels])
                 some[:channels].addcmul_(values, area)
                 if counted:
                     some[channels:].addcmul_(values.sign_(), area)

@@ -22,7 +22,7 @@ LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 """Methods on samples that are kept apart."""
 
 KERNEL_METHODS = {
-    *("KP", "KPCN", "MRKP", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "RHF", "SBMC"),
+    *("KP", "KPCN", "MRKP", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "RHF", "SBMC", "WLR"),
     *LAYERS,
 }
 """Outputs are sums of input pixels whose weights sum to 1: a constant image stays constant."""
@@ -34,7 +34,7 @@ others."""
 STEEP = {"RAE": 5}
 """How much larger rounding is in the output: it is the fifth power of what the network makes."""
 
-DECIDE = {"NFOR", "JointNLM", "RDFC", "RHF", "SBMC", *LAYERS}
+DECIDE = {"NFOR", "JointNLM", "RDFC", "RHF", "SBMC", "WLR", *LAYERS}
 """Methods that choose, between candidates or by an extremum: gradients reach less far than values."""
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -51,6 +51,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "RHF": {"window": 1},
     "RAE": {"stages": (4, 5), "tail": (6, 5)},
     "SBMC": {"features": PerSample.samples, "width": 4, "levels": 2, "rounds": 2, "kernel_size": 5},
+    "WLR": {"window": 2},
     **{key: {"width": 4, "levels": 3, "kernel_size": 5, "embedding": 8} for key in LAYERS},
 }
 """Narrower forms of large networks, with the same structure; the full sizes have tests of their own."""

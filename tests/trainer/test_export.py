@@ -189,6 +189,17 @@ def test_methods_of_hundreds_of_offsets_are_refused_with_the_reason(tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+SOLVED = {"WLR"}
+"""Methods that need an operation that ONNX does not have."""
+
+
+@pytest.mark.parametrize("name", sorted(SOLVED))
+def test_methods_with_eigenvectors_are_refused_with_the_reason(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} cannot be exported: it needs the eigenvectors"):
+        export(make(name), tmp_path / "net.onnx")
+    assert not list(tmp_path.iterdir())
+
+
 FILTERS = {"BMFR", "SVGF"}
 """Methods that look anywhere in the frame before."""
 
@@ -208,7 +219,7 @@ def test_a_filter_made_of_slices_is_exported_without_a_warning(tmp_path: Path, f
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize(
-    "name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"} - UNROLLED - FILTERS)
+    "name", sorted(set(models.__all__) - {"WSKP", "JointBilateral"} - UNROLLED - SOLVED - FILTERS)
 )
 def test_every_network_is_exported_and_takes_any_size(tmp_path: Path, name: str, format: str) -> None:
     torch.manual_seed(3)
