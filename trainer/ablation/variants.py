@@ -127,10 +127,10 @@ def _plain(value: Any) -> Any:
 
 
 def _digest(config: Mapping[str, Any]) -> str:
-    """Return what stands for a training; not for how it is recorded."""
+    """Return what stands for a training; not for how it is recorded, nor where its files lie."""
     flat = {
         key: value
         for key, value in flatten(config).items()
-        if not key.startswith(("trainer.logger", "trainer.callbacks"))
+        if not key.startswith(("trainer.logger", "trainer.callbacks", "config", "__default_config__"))
     }
     return hashlib.sha256(json.dumps(flat, sort_keys=True, default=str).encode()).hexdigest()[:16]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from trainer import configs
 from trainer.ablation.plan import Ablation, Variant, read_ablation
 from trainer.ablation.variants import Training, trainings_of
 from trainer.cluster.checked import parsed
@@ -56,6 +58,17 @@ def test_a_variant_registers_no_model_and_its_run_is_tagged(pair: list[Training]
     assert "ExportBest" not in names
     assert {"BestCheckpoint", "LastCheckpoint", "FiniteGuard", "TrainingProgress"} <= set(names)
     assert (pair[0].experiment, pair[0].data, str(pair[0].root)) == ("sizes", "sample:bmfr", "runs")
+
+
+def test_a_run_is_found_again_where_the_shipped_files_have_moved(
+    pair: list[Training], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = tmp_path / "configs"
+    shutil.copytree(configs.folder(), moved)
+    monkeypatch.setattr(configs, "folder", lambda: moved)
+    again = trainings_of(ablation(Variant("plain", WSKP)), REST)[0]
+    assert str(moved) in " ".join(again.arguments)
+    assert again.launch("a") == pair[0].launch("a")
 
 
 def test_what_is_trained_and_nothing_else_decides_which_run_is_gone_on_with(pair: list[Training]) -> None:
