@@ -12,7 +12,7 @@ Kind = Literal["stills", "sequences", "samples"]
 PASS_SAMPLES = 2**23
 """Samples of one pass of a reference: about half a minute of work, which is what an interruption can lose."""
 
-RECIPE_VERSION = 2
+RECIPE_VERSION = 1
 """Part of every job's key; raise it when the same recipe gives other pixels than before."""
 
 STILLS = (

@@ -66,15 +66,15 @@ class Variant:
         name: In tables.
         configs: Configurations that are laid over each other.
         options: Key of the configuration → value.
-        common: The same of all variants; options of the command line count more.
         places: Name of a layout → row and column, or number.
+        common: Options of all variants; those of the command line count more.
     """
 
     name: str
     configs: tuple[str, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
-    common: Mapping[str, Any] = field(default_factory=dict)
     places: Mapping[str, Place] = field(default_factory=dict)
+    common: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def _variant(
     places = entry.get("places") or {}
     _only(f"{place}, places", places, tuple(layouts))
     taken = {key: _place(f"{place}, places, {key}", layouts[key], value) for key, value in places.items()}
-    return Variant(name, tuple(files), options, common, taken)
+    return Variant(name, tuple(files), options, taken, common)
 
 
 def _place(place: str, layout: Layout, value: Any) -> Place:

@@ -154,7 +154,11 @@ def test_wrong_usage_ends_before_anything_is_made(
 ) -> None:
     for words, code, said in (
         (("--config", "wskp_bmfr.yaml"), 2, "describes no ablation"),
-        (("--config", "none"), 2, "ablations that ship: ablations/wskp_branches.yaml"),
+        (
+            ("--config", "none"),
+            2,
+            "ablations that ship: ablations/realtime.yaml, ablations/wskp_branches.yaml",
+        ),
         (("--config", "sizes.yaml", "--trainr.max_epochs", "2"), 2, "variant 'one': unknown option"),
         (("--config", "sizes.yaml", "--config", "smke.yaml"), 2, "did you mean smoke.yaml"),
         (("--config", "sizes.yaml", "--frames", "nowhere"), 1, "name a data set with --frames ROOT"),

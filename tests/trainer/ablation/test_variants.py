@@ -44,7 +44,7 @@ def test_a_variant_has_the_options_of_all_and_its_own_count_more(pair: list[Trai
 
 def test_the_command_line_counts_more_than_common_options_and_less_than_own_ones() -> None:
     common = {"trainer.max_epochs": 7, "model.net.width": 5, "trainer.max_steps": 11}
-    made = Variant("one", WSKP, {"model.net.width": 4}, common)
+    made = Variant("one", WSKP, {"model.net.width": 4}, common=common)
     config = config_of(trainings_of(ablation(made), REST)[0])
     assert (config.trainer.max_epochs, config.trainer.max_steps) == (2, 11)
     assert config.model.init_args.net.init_args.width == 4
