@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,8 @@ configuration and values) and optionally a `config`; trainer/ablation/plan.py sh
 """
 PASSES_ON = True
 EVALUATION = "evaluation"
+SCORED = ("best", "last")
+"""Checkpoints that are compared, the first that there is."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,7 +112,8 @@ def _train_and_compare(
     parent = ParentRun(ablation, trainings, args.output, _say)
     good = False
     try:
-        fitted = fit_all(trainings, identity, parent.tags(), args.output / "logs", _say)
+        trained = fit_all(trainings, identity, parent.tags(), args.output / "logs", _say)
+        fitted = [_with_checkpoint(one) for one in trained]
         parent.note(fitted)
         failed = [one for one in fitted if one.run is None]
         if len(failed) < len(fitted):
@@ -120,6 +124,13 @@ def _train_and_compare(
     for one in failed:
         _say(f"{one.name}: failed: {one.reason}")
     return 0 if good else 1
+
+
+def _with_checkpoint(one: Fitted) -> Fitted:
+    """Return a variant as failed where nothing of it is left to compare: the others are compared still."""
+    if one.run is None or any((one.run / "checkpoints" / f"{name}.ckpt").is_file() for name in SCORED):
+        return one
+    return replace(one, run=None, reason=f"{one.run} holds no checkpoint; remove that folder to train again")
 
 
 def _compare(

@@ -45,10 +45,11 @@ def stand_ins(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
     """Trainings that are made up, of which those in `failing` fail, and an evaluation of them.
 
     Returns:
-        `failing`, `skipped` by the evaluation, `tags` of the runs, and `words` that it was called with.
+        `failing`, `lost` that leave no checkpoint, `skipped` by the evaluation, `tags` of the runs, and
+        `words` that it was called with.
     """
     (workplace / "sizes.yaml").write_text(FILE)
-    heard: dict[str, Any] = {"failing": set(), "skipped": set()}
+    heard: dict[str, Any] = {"failing": set(), "skipped": set(), "lost": set()}
 
     def fit_all(
         trainings: Sequence[Training], identity: str, tags: Mapping[str, str], logs: Path, say: object
@@ -59,7 +60,8 @@ def stand_ins(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
             name = training.variant.name
             run = workplace / "runs" / "sizes" / name
             (run / "checkpoints").mkdir(parents=True, exist_ok=True)
-            (run / "checkpoints" / "best.ckpt").touch()
+            if name not in heard["lost"]:
+                (run / "checkpoints" / "best.ckpt").touch()
             failed = name in heard["failing"]
             found.append(Fitted(training, None if failed else run, "no memory" if failed else "", 1.0))
         return found
@@ -153,6 +155,17 @@ def test_a_name_that_begins_with_a_hyphen_is_evaluated(
     (workplace / "sizes.yaml").write_text(FILE.replace("name: one", "name: -bn"))
     assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 0
     assert stand_ins["words"].models[0][0].startswith("-bn=")
+
+
+def test_a_variant_whose_checkpoints_are_gone_does_not_keep_the_others_from_the_tables(
+    stand_ins: dict[str, Any], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_ins["lost"] = {"one"}
+    assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 1
+    table = (workplace / "out/tables/variants.md").read_text()
+    assert "one: failed: " in table
+    assert "holds no checkpoint; remove that folder to train again" in table
+    assert "| two | **21.00**" in table
 
 
 def test_nothing_is_evaluated_where_every_variant_failed(
