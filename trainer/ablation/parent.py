@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from trainer.ablation.fitting import Fitted
@@ -20,8 +23,32 @@ WAIT_S = 30.0
 """Seconds that an ablation waits for the tracking store before its first training."""
 
 
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Make a folder and keep other processes from working in it; the system lets go when this one ends.
+
+    Raises:
+        ValueError: Another process works in it, or it is a file.
+        OSError: It cannot be made or written to.
+    """
+    make_folder(folder)
+    file = os.open(folder, os.O_RDONLY)  # no file of a lock is left in it
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"another process is at work in {folder}; wait until it is done, or choose another --output"
+            ) from None
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(file)
+
+
 def take_folder(folder: Path, name: str) -> str:
-    """Make a folder, or find the ablation in it that is to go on; returns its identifier.
+    """Begin an ablation in an empty folder, or find the one that is to go on; returns its identifier.
 
     Raises:
         ValueError: It holds another ablation, or something else.
@@ -37,9 +64,8 @@ def take_folder(folder: Path, name: str) -> str:
         if other != name:
             raise ValueError(f"{folder} holds the ablation {other}, not {name}; choose another --output")
         return identity
-    if folder.is_dir() and any(folder.iterdir()):
+    if any(folder.iterdir()):
         raise ValueError(f"{folder} holds something else than an ablation; choose another --output")
-    make_folder(folder)
     identity = uuid.uuid4().hex
     write_whole(path, json.dumps({"id": identity, "name": name}) + "\n")
     return identity

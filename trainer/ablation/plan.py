@@ -35,6 +35,8 @@ METRICS = ("psnr_wskp", "ssim_wskp")
 PAIRS, CURVE = "pairs", "curve"
 RESERVED = (INPUT, REFERENCE, PLACES)
 """Names of columns and folders of every evaluation."""
+OVERVIEW = "variants"
+"""Name of the table that every ablation has."""
 _NAME = re.compile(r"[^\s=:/\\|][^=:/\\|\n]{0,59}")
 
 Place = tuple[str, str] | float
@@ -139,6 +141,8 @@ def read_ablation(path: Path) -> Ablation:
     names = [variant.name for variant in variants]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UsageError(f"{path}: two variants are called {twice[0]!r}")
+    for name, layout in layouts.items():
+        _check_places(path, layout, [(v.name, v.places[name]) for v in variants if name in v.places])
     return Ablation(
         path.stem, str(tree.get("title") or path.stem), variants, layouts, _metrics(path, tree.get("metrics"))
     )
@@ -161,11 +165,23 @@ def _layouts(path: Path, tree: Any) -> dict[str, Layout]:
         _only(place, entry, ("kind", "title", "axis"))
         if not re.fullmatch(r"\w+", str(name), re.ASCII):
             raise UsageError(f"{place}: names of layouts have letters, digits and _ only, as files have them")
+        if str(name).lower() == OVERVIEW:
+            raise UsageError(f"{place}: {OVERVIEW} is the table of all variants; choose another name")
         if entry.get("kind") not in (PAIRS, CURVE):
             raise UsageError(f"{place}: kind {entry.get('kind')!r}; expected {PAIRS} or {CURVE}")
         title = str(entry.get("title") or name)
         found[str(name)] = Layout(str(name), entry["kind"], title, str(entry.get("axis") or name))
     return found
+
+
+def _check_places(path: Path, layout: Layout, taken: list[tuple[str, Place]]) -> None:
+    """Raise a UsageError where two variants stand in one place of a table of pairs."""
+    seen: dict[Place, str] = {}
+    for name, place in taken if layout.kind == PAIRS else []:
+        if (other := seen.setdefault(place, name)) != name:
+            raise UsageError(
+                f"{path}, variant {name}, places, {layout.name}: {other!r} has the place {place} already"
+            )
 
 
 def _options(place: str, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,10 +197,10 @@ def _variant(
     name = entry.get("name") if isinstance(entry, dict) else None
     place = f"{path}, variant {name}"
     _only(place, entry, ("name", "config", "options", "places"))
-    if not isinstance(name, str) or not _NAME.fullmatch(name) or name in RESERVED:
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or name != name.strip() or name in RESERVED:
         raise UsageError(
-            f"{place}: expected a name of up to 60 letters without = : / \\ |, and none of "
-            f"{', '.join(RESERVED)}"
+            f"{place}: expected a name of up to 60 letters without = : / \\ | and spaces at its ends, and "
+            f"none of {', '.join(RESERVED)}"
         )
     files = entry.get("config", config)
     files = [files] if isinstance(files, str) else files
@@ -210,6 +226,6 @@ def _place(place: str, layout: Layout, value: Any) -> Place:
 def _metrics(path: Path, named: Any) -> tuple[str, ...]:
     if named is None:
         return METRICS
-    if not isinstance(named, list) or not named or any(name not in SCORES for name in named):
+    if not isinstance(named, list) or not named or any(str(name) not in SCORES for name in named):
         raise UsageError(f"{path}, metrics: {named!r}; expected a list of some of {', '.join(SCORES)}")
     return tuple(dict.fromkeys(named))

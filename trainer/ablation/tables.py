@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from trainer.ablation.plan import PAIRS, Ablation, Layout, Variant
+from trainer.ablation.plan import OVERVIEW, PAIRS, Ablation, Layout, Variant
 from trainer.evaluation.cells import Cell, Table
 from trainer.evaluation.plan import INPUT
 from trainer.evaluation.tables import AVERAGE, NOTE, Scored, ranked
@@ -32,7 +32,7 @@ class Measured:
         parameters: Name → of the network in training and deployed; None where that is not known.
         size: Width and height of the frames.
         device: Where time was measured.
-        failed: Name → why there is nothing of it.
+        failed: Name → why there is nothing of it, or not all.
     """
 
     scored: Scored
@@ -57,15 +57,13 @@ class Measured:
         methods = record["methods"]
         frames = rows[rows["method"] == INPUT]
         costs = {m["label"]: m["cost"] for m in methods if m["cost"]}
-        first = next(iter(costs.values()), {"device": "", "threads": 0})
-        threads = f", {first['threads']} threads" if first["device"] == "cpu" else ""
-        lost = {m["label"]: str(m["reason"]) for m in methods if m["status"] == "skipped"}
+        lost = {m["label"]: str(m["reason"]) for m in methods if m["status"] != "done" or m["reason"]}
         return Measured(
             Scored(rows, [INPUT, *(m["label"] for m in methods)], metrics),
             costs,
             {m["label"]: (m["parameters"], m["deployed"]) for m in methods},
             (int(frames["width"].median()), int(frames["height"].median())),
-            f"{first['device']}{threads}",
+            " or ".join(dict.fromkeys(_place(cost) for cost in costs.values())),
             {**failed, **lost},
         )
 
@@ -88,6 +86,12 @@ class Measured:
             f"{self.device}, warm, in a process of its own: median ± half the distance of the quartiles."
             + busy
         )
+
+
+def _place(cost: Mapping[str, Any]) -> str:
+    """Return where a time was measured; an earlier call may have had another number of threads."""
+    threads = f", {cost['threads']} thread{'s' * (cost['threads'] != 1)}"
+    return f"{cost['device']}{threads if cost['device'] == 'cpu' else ''}"
 
 
 def tables_of(ablation: Ablation, measured: Measured) -> list[Table]:
@@ -125,7 +129,7 @@ def overview(ablation: Ablation, measured: Measured) -> Table:
     )
     notes += [f"{name}: {reason}" for name, reason in measured.failed.items()]
     heads = (*_heads(measured), "parameters", "deployed", "ms per frame ↓")
-    return Table("variants", ablation.title, "variant", heads, table, tuple(notes))
+    return Table(OVERVIEW, ablation.title, "variant", heads, table, tuple(notes))
 
 
 def curve(ablation: Ablation, layout: Layout, measured: Measured) -> Table:

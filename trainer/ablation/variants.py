@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from trainer import configs
 from trainer.ablation.plan import Ablation, Variant
-from trainer.callbacks.recorder import flatten
 from trainer.cluster.checked import parsed
 from trainer.cluster.space import options
 from trainer.configs import UsageError
@@ -20,6 +19,10 @@ from trainer.training import TRACKING
 
 LEFT_OUT = ("ExportBest", "ValidationPictures")
 """Callbacks that variants do without: a model would be registered, and pictures drawn, for each of them."""
+
+_SHOWING = "TrainingProgress"
+_ELSEWHERE = ("config", "__default_config__", "ckpt_path", "trainer")
+"""Parts of a configuration that say nothing of a training, or are told apart."""
 
 
 @dataclass(frozen=True)
@@ -107,30 +110,31 @@ def _training(variant: Variant, experiment: str, rest: Sequence[str]) -> Trainin
         )
     tracked = logger["init_args"]
     callbacks = [_plain(callback) for callback in config["trainer"].get("callbacks") or []]
+    kept = tuple(c for c in callbacks if not c["class_path"].endswith(LEFT_OUT))
     return Training(
         variant,
         tuple(arguments),
-        _digest(config),
+        _digest(config, kept),
         Path(tracked["root"]),
         tracked["experiment"],
         tracked["tracking_uri"],
         str(config["data"]["init_args"]["root"]),
-        tuple(c for c in callbacks if not c["class_path"].endswith(LEFT_OUT)),
+        kept,
     )
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, otherwise: Callable[[Any], Any] = lambda value: value) -> Any:
     """Return a part of a configuration as mappings and lists."""
-    if hasattr(value, "as_dict"):
-        return value.as_dict()
-    return value
+    return value.as_dict() if hasattr(value, "as_dict") else otherwise(value)
 
 
-def _digest(config: Mapping[str, Any]) -> str:
-    """Return what stands for a training; not for how it is recorded, nor where its files lie."""
-    flat = {
-        key: value
-        for key, value in flatten(config).items()
-        if not key.startswith(("trainer.logger", "trainer.callbacks", "config", "__default_config__"))
+def _digest(config: Mapping[str, Any], callbacks: Sequence[Mapping[str, Any]]) -> str:
+    """Return what stands for a training; not for how it is recorded or shown, nor where its files lie."""
+    trainer = {k: v for k, v in config["trainer"].items() if k not in ("logger", "callbacks")}
+    told = {
+        **{key: part for key, part in config.items() if key not in _ELSEWHERE},
+        "trainer": trainer,
+        "callbacks": [c for c in callbacks if not c["class_path"].endswith(_SHOWING)],
     }
-    return hashlib.sha256(json.dumps(flat, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    text = json.dumps(told, sort_keys=True, default=lambda value: _plain(value, str))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

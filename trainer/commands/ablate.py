@@ -8,12 +8,14 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from trainer.ablation.fitting import Fitted
     from trainer.ablation.plan import Ablation
+    from trainer.ablation.variants import Training
 
 HELP = "train variants of a configuration and tabulate them"
 
@@ -31,6 +33,8 @@ configuration and values) and optionally a `config`; trainer/ablation/plan.py sh
 """
 PASSES_ON = True
 EVALUATION = "evaluation"
+SCORED = ("best", "last")
+"""Checkpoints that are compared, the first that there is."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,14 +70,15 @@ def run(args: argparse.Namespace) -> int:
 
     Raises:
         UsageError: The file, an option or a value is wrong; nothing was started.
-        ValueError: The folder holds something else, or there are no frames to compare on.
+        ValueError: The folder holds something else or another process works in it, or there are no frames to
+            compare on.
         OSError: A file cannot be read or written.
     """
-    from trainer.ablation.fitting import fit_all
-    from trainer.ablation.parent import ParentRun, take_folder
+    from trainer.ablation.parent import alone, take_folder
     from trainer.ablation.plan import find_ablation, read_ablation
     from trainer.ablation.variants import trainings_of
     from trainer.commands.denoise import check_device
+    from trainer.evaluation import keeping
     from trainer.evaluation.plan import clips_of
 
     check_device(args.device)
@@ -82,24 +87,50 @@ def run(args: argparse.Namespace) -> int:
     trainings = trainings_of(ablation, [*overlays, *args.rest])
     frames, split = (args.frames, "auto") if args.frames else (trainings[0].data, "test")
     try:
-        clips_of(frames, split)
+        clips, _ = clips_of(frames, split)
     except (ValueError, OSError) as error:
         raise ValueError(f"no frames to compare on: {error}; name a data set with --frames ROOT") from None
-    identity = take_folder(args.output, ablation.name)
+    with alone(args.output):
+        identity = take_folder(args.output, ablation.name)
+        # Now, not after the trainings: it may hold a comparison on other frames.
+        shown = keeping.identity_of(frames, clips)
+        keeping.take_folder(args.output / EVALUATION, shown, frames, args.force)
+        return _train_and_compare(ablation, trainings, identity, (frames, split), args)
+
+
+def _train_and_compare(
+    ablation: Ablation,
+    trainings: Sequence[Training],
+    identity: str,
+    data: tuple[str, str],
+    args: argparse.Namespace,
+) -> int:
+    """Train and compare below one run; returns the exit code."""
+    from trainer.ablation.fitting import fit_all
+    from trainer.ablation.parent import ParentRun
+
     parent = ParentRun(ablation, trainings, args.output, _say)
     good = False
     try:
-        fitted = fit_all(trainings, identity, parent.tags(), args.output / "logs", _say)
+        trained = fit_all(trainings, identity, parent.tags(), args.output / "logs", _say)
+        fitted = [_with_checkpoint(one) for one in trained]
         parent.note(fitted)
         failed = [one for one in fitted if one.run is None]
         if len(failed) < len(fitted):
-            good = _compare(ablation, fitted, frames, split, args) and not failed
+            good = _compare(ablation, fitted, *data, args) and not failed
             parent.keep()
     finally:
         parent.end(good)
     for one in failed:
         _say(f"{one.name}: failed: {one.reason}")
     return 0 if good else 1
+
+
+def _with_checkpoint(one: Fitted) -> Fitted:
+    """Return a variant as failed where nothing of it is left to compare: the others are compared still."""
+    if one.run is None or any((one.run / "checkpoints" / f"{name}.ckpt").is_file() for name in SCORED):
+        return one
+    return replace(one, run=None, reason=f"{one.run} holds no checkpoint; remove that folder to train again")
 
 
 def _compare(
@@ -125,7 +156,7 @@ def _compare(
     plots = write_plots(args.output, ablation, measured)
     print_overviews(tables)
     _say(f"written to {args.output}: {len(tables)} tables in tables, {len(plots)} files in plots")
-    return code == 0
+    return code == 0 and not measured.failed
 
 
 def _evaluate(
@@ -135,10 +166,11 @@ def _evaluate(
     from trainer.commands import evaluate
     from trainer.training import evaluated
 
-    words = ["--data", frames, "--split", split, "--output", str(args.output / EVALUATION)]
+    # With a sign: a name may begin with a hyphen.
+    words = [f"--data={frames}", "--split", split, f"--output={args.output / EVALUATION}"]
     words += ["--device", args.device, *(["--force"] if args.force else [])]
     for one in trained:
-        words += ["--model", f"{one.name}={evaluated(str(one.run), one.training.root, '')}"]
+        words += [f"--model={one.name}={evaluated(str(one.run), one.training.root, '')}"]
     for metric in ablation.metrics:
         words += ["--metric", metric]
     parser = argparse.ArgumentParser()

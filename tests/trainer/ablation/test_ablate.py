@@ -17,6 +17,7 @@ import pytest
 
 from trainer.ablation import fitting
 from trainer.ablation.fitting import Fitted
+from trainer.ablation.parent import alone
 from trainer.ablation.variants import Training
 from trainer.cli import main
 from trainer.commands import evaluate
@@ -44,10 +45,11 @@ def stand_ins(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
     """Trainings that are made up, of which those in `failing` fail, and an evaluation of them.
 
     Returns:
-        `failing`, `tags` of the runs, and `words` that the evaluation was called with.
+        `failing`, `lost` that leave no checkpoint, `skipped` by the evaluation, `tags` of the runs, and
+        `words` that it was called with.
     """
     (workplace / "sizes.yaml").write_text(FILE)
-    heard: dict[str, Any] = {"failing": set()}
+    heard: dict[str, Any] = {"failing": set(), "skipped": set(), "lost": set()}
 
     def fit_all(
         trainings: Sequence[Training], identity: str, tags: Mapping[str, str], logs: Path, say: object
@@ -58,7 +60,8 @@ def stand_ins(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
             name = training.variant.name
             run = workplace / "runs" / "sizes" / name
             (run / "checkpoints").mkdir(parents=True, exist_ok=True)
-            (run / "checkpoints" / "best.ckpt").touch()
+            if name not in heard["lost"]:
+                (run / "checkpoints" / "best.ckpt").touch()
             failed = name in heard["failing"]
             found.append(Fitted(training, None if failed else run, "no memory" if failed else "", 1.0))
         return found
@@ -71,8 +74,9 @@ def stand_ins(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any
         rows = [{"method": m, "psnr_wskp": x, "ssim_wskp": x / 100, **place} for m, x in scores.items()]
         args.output.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(rows).to_parquet(args.output / "rows.parquet")
-        facts = {"status": "done", "reason": None, "parameters": 12, "deployed": 10, "cost": None}
-        record = {"methods": [{"label": name, **facts} for name in names]}
+        facts = {"reason": None, "parameters": 12, "deployed": 10, "cost": None}
+        states = {name: "skipped" if name in heard["skipped"] else "done" for name in names}
+        record = {"methods": [{"label": name, "status": states[name], **facts} for name in names]}
         (args.output / "evaluation.json").write_text(json.dumps(record))
         return 0
 
@@ -137,6 +141,33 @@ def test_a_variant_that_failed_is_in_the_table_with_its_reason_and_the_exit_code
     assert "failed" not in (workplace / "out/tables/variants.md").read_text()
 
 
+def test_a_variant_that_the_evaluation_skips_makes_the_exit_code_1(
+    stand_ins: dict[str, Any], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_ins["skipped"] = {"two"}
+    assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 1
+    assert runs_of(workplace)["ablation out"].info.status == "FAILED"
+
+
+def test_a_name_that_begins_with_a_hyphen_is_evaluated(
+    stand_ins: dict[str, Any], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (workplace / "sizes.yaml").write_text(FILE.replace("name: one", "name: -bn"))
+    assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 0
+    assert stand_ins["words"].models[0][0].startswith("-bn=")
+
+
+def test_a_variant_whose_checkpoints_are_gone_does_not_keep_the_others_from_the_tables(
+    stand_ins: dict[str, Any], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_ins["lost"] = {"one"}
+    assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 1
+    table = (workplace / "out/tables/variants.md").read_text()
+    assert "one: failed: " in table
+    assert "holds no checkpoint; remove that folder to train again" in table
+    assert "| two | **21.00**" in table
+
+
 def test_nothing_is_evaluated_where_every_variant_failed(
     stand_ins: dict[str, Any], workplace: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,6 +214,35 @@ def test_a_folder_of_something_else_is_left_alone(
     (workplace / "other.yaml").write_text(FILE)
     assert ablate(monkeypatch, "--config", "other.yaml", "--output", "out") == 1
     assert "holds the ablation sizes, not other" in capsys.readouterr().err
+
+
+def test_other_frames_are_refused_before_anything_is_trained_and_taken_with_force(
+    stand_ins: dict[str, Any],
+    workplace: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ("--config", "sizes.yaml", "--output", "out")
+    assert ablate(monkeypatch, *words) == 0
+    del stand_ins["tags"]
+    assert ablate(monkeypatch, *words, "--frames", "sample:stills") == 1
+    assert "whose frames are others" in capsys.readouterr().err
+    assert "tags" not in stand_ins
+    assert ablate(monkeypatch, *words, "--frames", "sample:stills", "--force") == 0
+    assert stand_ins["words"].data == "sample:stills"
+
+
+def test_a_folder_that_another_process_works_in_is_left_to_it(
+    stand_ins: dict[str, Any],
+    workplace: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with alone(workplace / "out"):
+        assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 1
+    assert "another process is at work in out" in capsys.readouterr().err
+    assert not list((workplace / "out").iterdir())
+    assert ablate(monkeypatch, "--config", "sizes.yaml", "--output", "out") == 0
 
 
 TINY = (

@@ -106,6 +106,13 @@ GOOD = "config: wskp_bmfr.yaml\nlayouts: {t: {kind: pairs}, c: {kind: curve}}\n"
         (GOOD + "variants: [{name: a, option: {}}]", "unknown 'option'; expected name, config, options"),
         (GOOD + "variants: [a]", "expected a mapping with name"),
         (GOOD + "variants: [{name: a=b}]", "expected a name of up to 60 letters without"),
+        (GOOD + "variants: [{name: 'a '}]", "and spaces at its ends"),
+        (
+            GOOD + "variants: [{name: a, places: {t: [x, y]}}, {name: b, places: {t: [x, y]}}]",
+            "variant b, places, t: 'a' has the place ('x', 'y') already",
+        ),
+        ("layouts: {variants: {kind: pairs}}\nvariants: [{name: a}]", "choose another name"),
+        ("metrics: [[psnr]]\nconfig: x\nvariants: [{name: a}]", "expected a list of some of psnr_wskp"),
         (GOOD + "variants: [{name: input}]", "none of input, reference"),
         (GOOD + "variants: [{name: a, options: [1]}]", "options: expected lines such as"),
         (GOOD + "variants: [{name: a, places: {u: 1}}]", "places: unknown 'u'; expected t, c"),

@@ -79,6 +79,19 @@ def test_the_overview_has_every_variant_with_metrics_parameters_and_time_of_a_fr
     assert timing.endswith("Other programs took up to 31% of all cores meanwhile.")
 
 
+def test_what_broke_on_its_way_is_told_and_times_say_every_number_of_threads() -> None:
+    facts = {"parameters": 2, "deployed": 1}
+    cost = {"seconds_per_megapixel": 1.0, "spread": [1.0, 1.0], "device": "cpu", "others": 0.0}
+    methods = [
+        {"label": "six", "status": "failed", "reason": "SIGSEGV", "cost": {**cost, "threads": 1}, **facts},
+        {"label": "six plain", "status": "done", "reason": "1 of 4 frames: NaN", "cost": None, **facts},
+        {"label": "one", "status": "done", "reason": None, "cost": {**cost, "threads": 2}, **facts},
+    ]
+    found = Measured.of(measured().scored.rows, {"methods": methods}, ABLATION.metrics, {})
+    assert found.failed == {"six": "SIGSEGV", "six plain": "1 of 4 frames: NaN"}
+    assert "cpu, 1 thread or cpu, 2 threads, warm" in found.timing()
+
+
 def test_pairs_stand_beside_each_other_for_every_scene_and_metric_as_in_table_5() -> None:
     table = pairs(ABLATION, LAYOUTS["table5"], measured())
     assert table.columns == ("psnr_wskp ↑ w/", "psnr_wskp ↑ w/o", "ssim_wskp ↑ w/", "ssim_wskp ↑ w/o")

@@ -81,6 +81,21 @@ def test_what_is_trained_and_nothing_else_decides_which_run_is_gone_on_with(pair
     assert longer.launch("a") != pair[0].launch("a")
 
 
+def test_callbacks_are_part_of_what_is_trained_and_how_it_is_shown_is_not() -> None:
+    def made(monitor: str, interval: float) -> Training:
+        best = {"class_path": "trainer.callbacks.BestCheckpoint", "init_args": {"monitor": monitor}}
+        shown = {
+            "class_path": "trainer.callbacks.TrainingProgress",
+            "init_args": {"plain_interval_s": interval},
+        }
+        given = {"trainer.callbacks": [shown, best]}
+        return trainings_of(ablation(Variant("a", WSKP, given)), ())[0]
+
+    first = made("val/psnr_wskp", 15.0)
+    assert made("val/psnr_wskp", 3.0).digest == first.digest
+    assert made("val/ssim_wskp", 15.0).digest != first.digest
+
+
 @pytest.mark.parametrize(
     ("variants", "rest", "said"),
     [
