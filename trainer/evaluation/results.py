@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,8 @@ def write_results(
     measured = costs_of(outcomes, rows, setting, say) if costs else {}
     table = cost_table(measured, outcomes)
     tables = write_tables(rows, labels, setting, [table] if table else [])
-    with _drawn(folder, rows, Scored(rows, labels, setting.metrics), measured):
-        write_sheets(folder, rows, outcomes)
+    plots = partial(write_plots, folder, rows, Scored(rows, labels, setting.metrics), measured)
+    with _drawn(plots, partial(write_sheets, folder, rows, outcomes)):
         tracked = _tracked(outcomes, rows, setting, say) if record else None
         write_record(outcomes, rows, setting, measured, _pages(outcomes, tracked))
         write_page(folder)
@@ -65,15 +66,16 @@ def write_results(
 
 
 @contextmanager
-def _drawn(*plots: Any) -> Iterator[None]:
-    """Draw plots in another process meanwhile, and here where that was killed; raises as `write_plots`."""
-    with ProcessPoolExecutor(1, PROCESSES, initializer=quiet) as pool:
-        drawing = pool.submit(write_plots, *plots)
+def _drawn(*tasks: Callable[[], Any]) -> Iterator[None]:
+    """Draw in other processes meanwhile, and here where one was killed; raises as the tasks."""
+    with ProcessPoolExecutor(len(tasks), PROCESSES, initializer=quiet) as pool:
+        drawing = [pool.submit(task) for task in tasks]
         yield
-        try:
-            drawing.result()
-        except BrokenExecutor:
-            write_plots(*plots)
+        for task, drawn in zip(tasks, drawing, strict=True):
+            try:
+                drawn.result()
+            except BrokenExecutor:
+                task()
 
 
 def record_files(tracked: Tracked, folder: Path, say: Say) -> None:

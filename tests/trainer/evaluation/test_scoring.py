@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from functools import partial
 
 import pytest
 
@@ -29,17 +30,22 @@ def answers(monkeypatch):
 
 
 def draw(place, here):
-    """Stands for `write_plots`: dies anywhere but in the process `here`."""
+    """Draws; dies anywhere but in the process `here`."""
     if os.getpid() != here:
         os.kill(os.getpid(), signal.SIGKILL)
     place.write_text("plots")
 
 
-def test_plots_are_drawn_here_where_the_process_that_draws_them_was_killed(monkeypatch, tmp_path):
-    monkeypatch.setattr(results, "write_plots", draw)
-    with results._drawn(tmp_path / "plots", os.getpid()):
+def test_plots_and_sheets_are_drawn_here_where_a_process_that_draws_them_was_killed(tmp_path):
+    tasks = [partial(draw, tmp_path / name, os.getpid()) for name in ("plots", "sheets")]
+    with results._drawn(*tasks):
         (tmp_path / "page").write_text("page")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["page", "plots"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page", "plots", "sheets"]
+
+
+def test_what_drawing_raises_is_raised(tmp_path):
+    with pytest.raises(FileNotFoundError, match="lost"), results._drawn(partial(os.stat, tmp_path / "lost")):
+        pass
 
 
 def test_every_question_is_answered_before_the_block_ends(answers):
