@@ -54,6 +54,12 @@ HISTOGRAM = "histogram"
 HISTOGRAM_BINS = 20
 """Bins of each colour channel."""
 
+HISTOGRAM_MADE = (
+    "trainer render stills --histogram writes histograms, and trainer render samples keeps samples apart, "
+    "from which they follow"
+)
+"""Where the buffer comes from, which few frames have."""
+
 _PLAIN = (
     _radiance("color", "Noisy radiance, with albedo."),
     _radiance(

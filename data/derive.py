@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data import camera as cameras
-from data.buffers import BUFFERS, HISTOGRAM
+from data.buffers import BUFFERS, HISTOGRAM, HISTOGRAM_MADE
 from data.camera import Camera, DepthKind
 from data.dropped import mean as mean_of_samples
 from data.frame import Frame, Image, Samples
-from data.histograms import HISTOGRAM_MADE, sample_histogram
+from data.histograms import sample_histogram
 
 ALBEDO_FLOOR = 0.01
 """Smallest effective albedo per channel. Division by it raises radiance at most a hundredfold, which keeps

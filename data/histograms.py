@@ -23,12 +23,6 @@ from data.buffers import HISTOGRAM_BINS
 
 Array = NDArray[np.float32]
 
-HISTOGRAM_MADE = (
-    "trainer render stills --histogram writes histograms, and trainer render samples keeps samples apart, "
-    "from which they follow"
-)
-"""Where the buffer comes from, which few frames have."""
-
 GAMMA = 2.2
 """Exponent of the tone curve."""
 

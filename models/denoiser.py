@@ -195,6 +195,14 @@ class Denoiser(nn.Module):
         """Return the form used for inference, equal to 1e-5; by default the module itself."""
         return self
 
+    def made_by(self, missing: Collection[str]) -> str:
+        """Return what makes buffers that are missing, or does without them; empty: nothing to say.
+
+        Args:
+            missing: Names of them, at least one.
+        """
+        return ""
+
     def check(self, buffers: Buffers) -> tuple[int, int, int]:
         """Check names and shapes of the inputs and return (B, H, W).
 
@@ -203,9 +211,10 @@ class Denoiser(nn.Module):
         """
         missing = [name for name in self.inputs if name not in buffers]
         if missing:
+            hint = self.made_by(missing)
             raise ValueError(
-                f"{type(self).__name__} needs the buffers {', '.join(self.inputs)}; "
-                f"missing: {', '.join(missing)}; given: {', '.join(buffers) or 'none'}"
+                f"{type(self).__name__} needs the buffers {', '.join(self.inputs)}; missing: "
+                f"{', '.join(missing)}; given: {', '.join(buffers) or 'none'}{hint and f'. {hint}'}"
             )
         for name in self.inputs:
             if not isinstance(buffers[name], Tensor):

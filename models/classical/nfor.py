@@ -182,16 +182,10 @@ class NFOR(Denoiser):
 
     def instead(self, available: Collection[str]) -> tuple[Denoiser, tuple[str, ...]] | None:
         """Return NFOR with halves and variances from what there is; see `Denoiser.instead`."""
-        noises, reasons = dict(self.noises), []
-        for name, noise in self.noises.items():
-            if not all(part in available for part in halves.inputs(name, noise)):
-                found = halves.possible(name, noise, available)
-                if found is None:
-                    return None
-                noises[name], reason = found
-                reasons.append(reason)
-        if not reasons:
+        found = halves.substituted(self.noises, available)
+        if found is None:
             return None
+        noises, reasons = found
         color_noise, *feature_noise = noises.values()
         changed: dict[str, Any] = {"color_noise": color_noise, "feature_noise": feature_noise}
         if self._selects and not halves.independent(color_noise):

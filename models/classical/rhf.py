@@ -19,11 +19,12 @@ spreads over the window. The distance of different patches grows with the number
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import torch.nn.functional as F
 from torch import Tensor
 
-from data.buffers import HISTOGRAM
-from data.histograms import HISTOGRAM_MADE
+from data.buffers import HISTOGRAM, HISTOGRAM_MADE
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops.histogram import coarser_histogram, histogram_filter
 from models.ops.histogram_distance import HistogramKernel
@@ -83,14 +84,9 @@ class RHF(Denoiser):
         result = self._scale(color, histogram, self.scales, self.kernel)
         return Denoised(result[..., :height, :width])
 
-    def check(self, buffers: Buffers) -> tuple[int, int, int]:
-        """Check names and shapes; where the histogram is missing say where it comes from."""
-        try:
-            return super().check(buffers)
-        except ValueError as error:
-            if HISTOGRAM in buffers:
-                raise
-            raise ValueError(f"{error}. {HISTOGRAM_MADE}") from None
+    def made_by(self, missing: Collection[str]) -> str:
+        """Say where histograms come from."""
+        return HISTOGRAM_MADE if HISTOGRAM in missing else ""
 
     def _scale(self, color: Tensor, histogram: Tensor, scales: int, kernel: HistogramKernel) -> Tensor:
         fine = histogram_filter(color, histogram, kernel, self.memory, fused=self.fused)

@@ -27,17 +27,8 @@ class SequenceFilter(Denoiser):
     frame_numbers = ("exposure",)
     no_export = "each of its frames needs the state of the one before, which exported files do not hand over"
 
-    def check(self, buffers: Buffers) -> tuple[int, int, int]:
-        """Check names and shapes; where buffers are missing say which commands make them."""
-        try:
-            return super().check(buffers)
-        except ValueError as error:
-            missing = [name for name in self.inputs if name not in buffers]
-            if not missing:
-                raise
-            raise ValueError(f"{error}. {self._made_by(missing)}") from None
-
-    def _made_by(self, missing: list[str]) -> str:
+    def made_by(self, missing: Collection[str]) -> str:
+        """Say which commands make what is missing."""
         hint = f"{type(self).__name__} works on sequences: `trainer render sequences` writes all it reads"
         derived = [name for name in missing if name in ("motion", "depth")]
         if derived:

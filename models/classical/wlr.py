@@ -173,30 +173,16 @@ class WLR(Denoiser):
             looked.append(reach + (self._prefilter.reach_final if filtered and self._prefilter else 0))
         return self.rule.window + self.rule.map_reach + max(looked)
 
-    def check(self, buffers: Buffers) -> tuple[int, int, int]:
-        """Check names and shapes; where means, halves or variances are missing say what makes them."""
-        try:
-            return super().check(buffers)
-        except ValueError as error:
-            if all(name in buffers for name in self.inputs):
-                raise
-            raise ValueError(
-                f"{error}. `trainer render stills` writes halves and variances; color_noise=estimated needs "
-                "color alone; feature_noise=none takes features as they are"
-            ) from None
+    def made_by(self, missing: Collection[str]) -> str:
+        """Say what makes halves and variances, or does without."""
+        return halves.MADE
 
     def instead(self, available: Collection[str]) -> tuple[Denoiser, tuple[str, ...]] | None:
         """Return WLR with means and variances from what there is; see `Denoiser.instead`."""
-        noises, reasons = dict(self.noises), []
-        for name, noise in self.noises.items():
-            if not all(part in available for part in halves.inputs(name, noise)):
-                found = halves.possible(name, noise, available)
-                if found is None:
-                    return None
-                noises[name], reason = found
-                reasons.append(reason)
-        if not reasons:
+        found = halves.substituted(self.noises, available)
+        if found is None:
             return None
+        noises, reasons = found
         color_noise, *feature_noise = noises.values()
         changed: dict[str, Any] = {"color_noise": color_noise, "feature_noise": feature_noise}
         if self.fireflies == "limit" and not halves.independent(color_noise):

@@ -56,6 +56,12 @@ SMOOTHING = 1
 ESTIMATE = 3
 """Radius of the box over which `estimated_variance` looks."""
 
+MADE = (
+    "`trainer render stills` writes halves and variances; color_noise=estimated needs color alone; "
+    "feature_noise=none takes features as they are"
+)
+"""What makes halves and variances, or does without."""
+
 _PARTS: dict[str, tuple[str, ...]] = {
     "measured": ("_a", "_b", "_variance"),
     "halves": ("_a", "_b"),
@@ -180,6 +186,29 @@ def possible(name: str, noise: Noise, available: Collection[str]) -> tuple[Noise
             reason = _REASONS[other].format(name)
             return other, f"no {' and no '.join(missing)}: {reason}"
     return None
+
+
+def substituted(
+    noises: Mapping[str, Noise], available: Collection[str]
+) -> tuple[dict[str, Noise], list[str]] | None:
+    """Return where halves and variances of all buffers can come from, and one sentence for each that changed.
+
+    Args:
+        noises: Name of the plain buffer → where they were to come from.
+        available: Names of the buffers that there are.
+
+    Returns:
+        None where nothing is missing, or one buffer has no other way left.
+    """
+    changed, reasons = dict(noises), []
+    for name, noise in noises.items():
+        if not all(part in available for part in inputs(name, noise)):
+            found = possible(name, noise, available)
+            if found is None:
+                return None
+            changed[name], reason = found
+            reasons.append(reason)
+    return (changed, reasons) if reasons else None
 
 
 def checked(option: str, noise: Noise, allowed: Collection[str] = get_args(Noise)) -> Noise:

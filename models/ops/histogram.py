@@ -28,38 +28,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from data.buffers import HISTOGRAM_BINS
-from data.histograms import GAMMA, LARGEST, SATURATION
 from models.ops.boxes import box_sum_valid, exporting
 from models.ops.histogram_distance import HistogramKernel, HistogramPatches
 from models.ops.nlm import strips, use_fused
 from models.ops.pyramid import coarser
 from models.pace import tick
-
-
-def sample_histogram(radiance: Tensor, exposure: Tensor | float = 1.0) -> Tensor:
-    """Return the histograms of samples; the formula is in `data.histograms`.
-
-    Args:
-        radiance: Linear radiance (B, S, 3, H, W); samples that are not finite in every channel do not count.
-        exposure: Brings it to a displayable level; broadcasts to (B, 3, H, W).
-
-    Returns:
-        (B, 60, H, W): 20 bins of red, of green, of blue.
-    """
-    batch, _, channels, height, width = radiance.shape
-    result = radiance.new_zeros(batch, channels, HISTOGRAM_BINS, height, width)
-    last = HISTOGRAM_BINS - 2
-    for sample in radiance.unbind(1):
-        weight = sample.isfinite().all(1, keepdim=True).to(sample.dtype)
-        light = torch.nan_to_num(sample, 0.0, 0.0, 0.0).clamp_min(0.0) * exposure
-        value = (light.pow(1 / GAMMA) / LARGEST).clamp_max(SATURATION)
-        low = (value * last).floor().clamp_max(last)
-        upper = torch.where(low < last, value * last - low, (value - 1) / (SATURATION - 1)).clamp(0, 1)
-        place = low.long()[:, :, None]
-        upper = (upper * weight)[:, :, None]
-        result.scatter_add_(2, place, weight[:, :, None] - upper)
-        result.scatter_add_(2, place + 1, upper)
-    return result.flatten(1, 2)
 
 
 def coarser_histogram(histogram: Tensor) -> Tensor:

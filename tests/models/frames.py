@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from models.ops.histogram import sample_histogram
+from data.histograms import sample_histogram
 
 
 def random_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
@@ -59,8 +60,14 @@ def split_buffers(batch: int, height: int, width: int, seed: int = 0) -> dict[st
     for name, source in (("reference", "color"), ("reference_diffuse", "diffuse")):
         buffers[name] = torch.nn.functional.avg_pool2d(buffers[source], 5, 1, 2)
     light = -torch.log1p(-torch.rand(batch, 8, 3, height, width, generator=generator))
-    buffers["histogram"] = sample_histogram(buffers["color"][:, None] * light)
+    buffers["histogram"] = histogram_of(buffers["color"][:, None] * light)
     return buffers
+
+
+def histogram_of(samples: Tensor) -> Tensor:
+    """Histograms (B, 60, H, W) of samples (B, S, 3, H, W)."""
+    images = [sample_histogram(image.permute(0, 2, 3, 1).numpy()) for image in samples.detach()]
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).to(samples.dtype)
 
 
 def lit(buffers: dict[str, Tensor]) -> dict[str, Tensor]:

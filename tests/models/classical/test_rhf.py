@@ -9,11 +9,11 @@ from torch import Tensor
 
 from models import RHF
 from models.denoiser import Buffers
-from models.ops.histogram import coarser_histogram, histogram_filter, sample_histogram
+from models.ops.histogram import coarser_histogram, histogram_filter
 from models.ops.histogram_distance import HistogramKernel
 from models.ops.pyramid import coarser
 from tests.models import plain_rhf
-from tests.models.frames import largest_relative
+from tests.models.frames import histogram_of, largest_relative
 
 pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
@@ -27,7 +27,7 @@ def noisy(height: int, width: int, spp: int = 8, seed: int = 0) -> Tensor:
 
 
 def buffers_of(samples: Tensor) -> dict[str, Tensor]:
-    return {"color": samples.mean(0)[None], "histogram": sample_histogram(samples[None])}
+    return {"color": samples.mean(0)[None], "histogram": histogram_of(samples[None])}
 
 
 def rows_of(image: Tensor) -> plain_rhf.Array:
@@ -62,7 +62,7 @@ def test_pixels_with_different_numbers_of_samples_are_compared_as_the_formula_sa
     samples = noisy(10, 9, 12)
     samples[5:, :, ::2] = torch.nan
     samples[:, :, 4, 4] = torch.nan
-    buffers = {"color": samples.nanmean(0).nan_to_num()[None], "histogram": sample_histogram(samples[None])}
+    buffers = {"color": samples.nanmean(0).nan_to_num()[None], "histogram": histogram_of(samples[None])}
     found = RHF(1, 2)(buffers).color
     assert np.abs(rows_of(found) - plain(buffers, 1, 2)).max() < 1e-12
 
@@ -87,7 +87,7 @@ def test_pixels_of_different_distributions_with_equal_means_are_not_mixed() -> N
     samples[::2, :, :, 8:], samples[1::2, :, :, 8:] = 0.0, 2.0
     mark = torch.zeros(1, 3, 16, 16, dtype=torch.float64)
     mark[..., 8:] = 1.0
-    buffers = {"color": mark, "histogram": sample_histogram(samples[None])}
+    buffers = {"color": mark, "histogram": histogram_of(samples[None])}
     found = RHF(1, nearest=0)(buffers).color
     # Patches that lie across the edge are only like others that do.
     torch.testing.assert_close(found, mark, rtol=0, atol=1e-12)
@@ -123,7 +123,7 @@ def test_strips_of_any_height_give_the_same_bits(fused: bool) -> None:
 
 
 def test_a_coarser_histogram_holds_the_samples_of_four_pixels_and_the_shares_of_the_low_pass() -> None:
-    histogram = sample_histogram(noisy(8, 12, 6)[None])
+    histogram = histogram_of(noisy(8, 12, 6)[None])
     small = coarser_histogram(histogram)
     assert small.shape == (1, 60, 4, 6)
     torch.testing.assert_close(small, 4 * coarser(histogram), rtol=1e-12, atol=1e-12)
