@@ -47,6 +47,7 @@ from models.blocks.reflect_conv import ReflectConv
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.boxes import exporting
 from models.ops.guides import depth_range, finite, relative_depth, unit_normal
+from models.ops.padding import padded
 from models.ops.reflect_conv import pointwise
 from models.ops.tonemap import exposed, radiance_of
 from models.ops.windows import Windows
@@ -194,10 +195,7 @@ class AFGSA(Denoiser):
         return self._padded(noisy), None if aux is None else self._padded(aux)
 
     def _padded(self, images: Tensor) -> Tensor:
-        height, width = images.shape[-2:]
-        bottom, right = -height % self.multiple, -width % self.multiple
-        if self.multiple > 1 and (exporting() or bottom or right):
-            images = F.pad(images, (0, right, 0, bottom), mode="replicate")
+        images = padded(images, self.multiple)
         # Convolutions with many channels and matrix products both want channels innermost.
         return images if exporting() else images.contiguous(memory_format=torch.channels_last)
 

@@ -57,6 +57,7 @@ from models.denoiser import Buffers, Denoised
 from models.ops.boxes import exporting
 from models.ops.gather_inside import gather_inside
 from models.ops.outgoing import send
+from models.ops.padding import padded
 from models.ops.per_sample import Seen
 from models.ops.precision import wide
 from models.ops.splat import splat_apart, splat_exp
@@ -120,7 +121,7 @@ class _Sampled(PerSample):
 
         numbers = self._images(frame) * (FEATURES + 3 * self.embedding)
         image = streamed(mean, [frame.samples], numbers, self.recompute, frame.numbers)
-        return list(self.unet(self._padded(image)))
+        return list(self.unet(padded(image, self.multiple, repeat=False)))
 
 
 class Layer(_Sampled):
@@ -211,7 +212,9 @@ class Layer(_Sampled):
         numbers = self._images(frame) * (FEATURES + 3 * self.embedding + 48)
         context = context[..., :height, :width]
         tensors = [frame.samples, context]
-        made = self._padded(streamed(shares, tensors, numbers, self.recompute, frame.numbers))
+        made = padded(
+            streamed(shares, tensors, numbers, self.recompute, frame.numbers), self.multiple, repeat=False
+        )
         return Sorted(*made.split([3, 1, self.embedding], 2))
 
     def _composited(self, layers: Sorted, contexts: list[Tensor]) -> Composite:
@@ -406,7 +409,11 @@ class PixelGather(PerSample):
             return torch.cat([seen.radiance.sum(1) / count, seen.counts.amax(1), mean, spread], 1)
 
         numbers = self._images(frame) * 3 * FEATURES
-        made = self._padded(streamed(moments, [frame.samples], numbers, self.recompute, frame.numbers))
+        made = padded(
+            streamed(moments, [frame.samples], numbers, self.recompute, frame.numbers),
+            self.multiple,
+            repeat=False,
+        )
         image, counts, features = made.split([3, 1, 2 * FEATURES], 1)
         embedding = wide(self.reducer(features))
         context = self.unet(embedding)[0]

@@ -54,6 +54,7 @@ from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.boxes import exporting
 from models.ops.gather_inside import gather_inside
 from models.ops.gather_positive import gather_positive
+from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.resolutions import Upsampling, blended, resolutions
 from models.ops.ten_channels import FEATURES, depth_bounds, ten_channels
@@ -181,7 +182,7 @@ class MRKP(Denoiser):
             ValueError: A buffer is missing or has another shape.
         """
         predicted = self.predict(buffers)
-        images = resolutions(self._padded(buffers["irradiance"]), len(predicted) + self.raw_level)
+        images = resolutions(padded(buffers["irradiance"], self.multiple), len(predicted) + self.raw_level)
         gather = gather_inside if self.kernels == "softmax" else gather_positive
         result = images[-1]
         for image, (kernels, alpha) in zip(images[len(predicted) - 1 :: -1], predicted[::-1], strict=True):
@@ -200,7 +201,7 @@ class MRKP(Denoiser):
             ValueError: A buffer is missing or has another shape.
         """
         self.check(buffers)
-        maps = self._padded(ten_channels(buffers, self.exposure(buffers), _CURVES[self.color]))
+        maps = padded(ten_channels(buffers, self.exposure(buffers), _CURVES[self.color]), self.multiple)
         if not exporting():
             # oneDNN and cuDNN convolve faster with channels innermost.
             maps = maps.contiguous(memory_format=torch.channels_last)
@@ -244,13 +245,6 @@ class MRKP(Denoiser):
             kernels if self.kernels == "softmax" else F.relu(kernels),
             torch.sigmoid(alpha) if self.alpha == "sigmoid" else F.relu(alpha),
         )
-
-    def _padded(self, images: Tensor) -> Tensor:
-        """Return images on the grid of the U-Net."""
-        bottom, right = (-side % self.multiple for side in images.shape[-2:])
-        if exporting() or bottom or right:
-            return F.pad(images, (0, right, 0, bottom), mode="replicate")
-        return images
 
 
 def _check(chosen: Mapping[str, Any], kernel_size: int, width: int, levels: int, resolutions: int) -> None:

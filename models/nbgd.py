@@ -40,10 +40,10 @@ from torch import Tensor, nn
 
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.bilateral_grid import create_grid, slice_grid
-from models.ops.boxes import exporting
 from models.ops.grid_cells import LEVELS, Cells
 from models.ops.guides import depth_range, finite
 from models.ops.outliers import replace_outliers
+from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.ten_channels import FEATURES, ten_channels
 from models.ops.tonemap import LARGEST, exposed, filmic, gamma
@@ -176,7 +176,7 @@ class NBGD(Denoiser):
             "normal": finite(buffers["normal"]).clamp(-1.0, 1.0),
             "depth": finite(buffers["depth"]).clamp_min(0.0),
         }
-        clean = {name: self._padded(image) for name, image in clean.items()}
+        clean = {name: padded(image, self.multiple) for name, image in clean.items()}
         exposure = wide(self.exposure(buffers))
         if self.outliers:
             clean["irradiance"] = replace_outliers(
@@ -184,13 +184,6 @@ class NBGD(Denoiser):
             )
         bounds = depth_range(buffers["depth"]) if given is None else wide(given)
         return {**clean, "exposure": exposure, "depth_range": bounds}
-
-    def _padded(self, images: Tensor) -> Tensor:
-        height, width = images.shape[-2:]
-        bottom, right = -height % self.multiple, -width % self.multiple
-        if exporting() or bottom or right:
-            images = F.pad(images, (0, right, 0, bottom), mode="replicate")
-        return images
 
     def _features(self, clean: Mapping[str, Tensor]) -> Tensor:
         return ten_channels(clean, clean["exposure"], self._toned)

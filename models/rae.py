@@ -42,6 +42,7 @@ from data.buffers import buffer
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, State, select
 from models.ops.boxes import exporting
 from models.ops.guides import finite
+from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.ten_channels import depth_bounds, scaled_depth
 from models.ops.tonemap import LARGEST
@@ -191,7 +192,7 @@ class RAE(Denoiser):
     def _toned(self, buffers: Buffers, state: State | None) -> tuple[Tensor, State]:
         """Return e (B, 3, H, W) and the next state."""
         height, width = self.check(buffers)[1:]
-        maps = self._padded(self._channels(buffers))
+        maps = padded(self._channels(buffers), self.multiple)
         if not exporting():
             # oneDNN and cuDNN convolve faster with channels innermost.
             maps = maps.contiguous(memory_format=torch.channels_last)
@@ -222,13 +223,6 @@ class RAE(Denoiser):
         found = {name: tuple(image.shape) for name, image in state.items()}
         if found != wanted:
             raise ValueError(f"the state is that of another batch or size: {found}, expected {wanted}")
-
-    def _padded(self, images: Tensor) -> Tensor:
-        """Return images on the grid of the network."""
-        bottom, right = (-side % self.multiple for side in images.shape[-2:])
-        if exporting() or bottom or right:
-            return F.pad(images, (0, right, 0, bottom), mode="replicate")
-        return images
 
 
 def _tone(image: Tensor) -> Tensor:

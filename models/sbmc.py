@@ -39,7 +39,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -52,6 +51,7 @@ from models.ops.boxes import exporting
 from models.ops.gather import pad_border
 from models.ops.guides import farthest, finite
 from models.ops.loops import overlapped
+from models.ops.padding import padded
 from models.ops.per_sample import FEATURE_LIMIT, Seen, sample_depths
 from models.ops.precision import wide
 from models.ops.streaming import streamed
@@ -250,15 +250,8 @@ class SBMC(Denoiser):
             numbers = batch * count * (frame.samples.shape[2] + 2 * self.width * (step + 1))
             tensors = [frame.samples, *contexts]
             made = streamed(mean, tensors, numbers, self.recompute, frame.numbers)
-            contexts.append(unet(self._padded(made))[..., :height, :width])
+            contexts.append(unet(padded(made, self.multiple, repeat=False))[..., :height, :width])
         return contexts
-
-    def _padded(self, maps: Tensor) -> Tensor:
-        """Return maps (…, H, W) padded to the grid of the U-Nets by zeros, as pixels without samples have."""
-        bottom, right = (-side % self.multiple for side in maps.shape[-2:])
-        if exporting() or bottom or right:
-            return F.pad(maps, (0, right, 0, bottom))
-        return maps
 
     def _filtered(self, frame: Frame, buffers: Buffers) -> Tensor:
         """Return exposed radiance (B, 3, H, W)."""
@@ -289,7 +282,8 @@ class SBMC(Denoiser):
         inside = Arrivals(*(image[..., reach : reach + height, :] for image in sums))
         if self.outside == "drop":
             return inside
-        inside = Arrivals(*(self._padded(image) for image in inside))  # the grid's pixels are not outside
+        # The grid's pixels are not outside.
+        inside = Arrivals(*(padded(image, self.multiple, repeat=False) for image in inside))
         return with_outside(inside, self.kernel_size, 1 if self.average else frame.samples.shape[1])
 
     def _gathered(self, frame: Frame, contexts: list[Tensor]) -> Arrivals:

@@ -30,13 +30,13 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from models.blocks.average_unet import AverageUNet
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops.boxes import exporting
 from models.ops.kernel_views import VIEWS_BYTES, full_size, kernel_views
+from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.resolutions import blended, resolutions
 from models.ops.sharing import reconstruct
@@ -122,7 +122,7 @@ class MultiResolutionWSKP(Denoiser):
             ValueError: A buffer is missing or has another shape.
         """
         predicted = self.predict(buffers)
-        images = resolutions(self._padded(buffers["irradiance"]), len(predicted))
+        images = resolutions(padded(buffers["irradiance"], self.multiple), len(predicted))
         result = images[-1]
         for image, level in zip(images[::-1], predicted[::-1], strict=True):
             filtered = reconstruct(image, level.log_importance, level.fusion_logits, self.kernel_sizes)
@@ -146,7 +146,7 @@ class MultiResolutionWSKP(Denoiser):
             ValueError: A buffer is missing or has another shape.
         """
         self.check(buffers)
-        maps = self._padded(ten_channels(buffers, self.exposure(buffers), CURVES[self.curve]))
+        maps = padded(ten_channels(buffers, self.exposure(buffers), CURVES[self.curve]), self.multiple)
         if not exporting():
             # oneDNN and cuDNN convolve faster with channels innermost.
             maps = maps.contiguous(memory_format=torch.channels_last)
@@ -172,10 +172,3 @@ class MultiResolutionWSKP(Denoiser):
         count = len(self.kernel_sizes)
         log_importance, fusion_logits = made[:, :count].contiguous(), made[:, count : 2 * count].contiguous()
         return Level(log_importance, fusion_logits, torch.sigmoid(wide(made[:, 2 * count :])))
-
-    def _padded(self, images: Tensor) -> Tensor:
-        """Return images on the grid of the U-Net."""
-        bottom, right = (-side % self.multiple for side in images.shape[-2:])
-        if exporting() or bottom or right:
-            return F.pad(images, (0, right, 0, bottom), mode="replicate")
-        return images

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from data.buffers import SAMPLE_BUFFERS, SAMPLES, sample_channels
 from models.blocks.pointwise import Pointwise
 from models.blocks.unet import UNet, Upsampling
 from models.denoiser import Buffers, Denoiser
-from models.ops.boxes import exporting
 from models.ops.guides import farthest
 from models.ops.per_sample import Seen, known, sample_depths, seen
 from models.ops.precision import wide
@@ -159,14 +157,6 @@ class PerSample(Denoiser):
         parts["radiance"] = srgb_log(radiance)
         parts["depth"] = parts["depth"] / frame.farthest[:, None]
         return seen(radiance, [parts[name] for name in self.order], counts)
-
-    def _padded(self, maps: Tensor) -> Tensor:
-        """Return maps (…, H, W) padded to the grid of the U-Net by zeros, as pixels without samples have."""
-        height, width = maps.shape[-2:]
-        bottom, right = -height % self.multiple, -width % self.multiple
-        if exporting() or bottom or right:
-            return F.pad(maps, (0, right, 0, bottom))
-        return maps
 
     def _images(self, frame: Frame) -> int:
         return frame.samples.shape[0] * frame.samples.shape[1]
