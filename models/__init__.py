@@ -21,6 +21,7 @@ from models.denoiser import Denoiser as Denoiser
 from models.kp import KP
 from models.kpcn import KPCN
 from models.layers import Layer, Optimized, PixelGather, SampleSplat
+from models.lbf import LBF
 from models.mrkp import MRKP
 from models.nbgd import NBGD
 from models.rae import RAE
@@ -34,6 +35,7 @@ __all__ = [
     "BMFR",
     "KP",
     "KPCN",
+    "LBF",
     "MRKP",
     "NBGD",
     "NFOR",

@@ -23,6 +23,7 @@ LAYERS = {"Layer", "Optimized", "PixelGather", "SampleSplat"}
 
 KERNEL_METHODS = {
     *("KP", "KPCN", "MRKP", "NBGD", "WSKP", "MultiResolutionWSKP", "JointBilateral", "RHF", "SBMC", "WLR"),
+    "LBF",
     *LAYERS,
 }
 """Outputs are sums of input pixels whose weights sum to 1: a constant image stays constant."""
@@ -34,13 +35,22 @@ others."""
 STEEP = {"RAE": 5}
 """How much larger rounding is in the output: it is the fifth power of what the network makes."""
 
-DECIDE = {"NFOR", "JointNLM", "RDFC", "RHF", "SBMC", "WLR", *LAYERS}
+DECIDE = {"LBF", "NFOR", "JointNLM", "RDFC", "RHF", "SBMC", "WLR", *LAYERS}
 """Methods that choose, between candidates or by an extremum: gradients reach less far than values."""
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "AFGSA": {"width": 16, "blocks": 2, "heads": 2},
     "KPCN": {"width": 8, "layers": 3, "kernel_size": 7},
     "ACFM": {"blocks": 2, "width": 16, "condition_width": 16, "condition": 8},
+    "LBF": {
+        "features": ("normal", "albedo", "depth"),
+        "window": 2,
+        "prefilter_window": 1,
+        "prefilter_patch": 1,
+        "prefilter_smoothing": 1,
+        "spike_window": 3,
+        "variance_spikes": 3.0,
+    },
     "MRKP": {"width": 16},
     "MultiResolutionWSKP": {"width": 16},
     "NFOR": {"window": 1, "patch": 1, "prefilter_window": 1, "final_window": 1},

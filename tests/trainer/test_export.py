@@ -178,7 +178,7 @@ def test_a_denoiser_without_frame_numbers_or_parameters_is_exported(tmp_path: Pa
     assert torch.allclose(load_artifact(path)({"color": color}).color, Blur()({"color": color}).color)
 
 
-UNROLLED = {"NFOR", "NLM", "JointNLM", "MultiScaleNLM", "RDFC", "RHF"}
+UNROLLED = {"LBF", "NFOR", "NLM", "JointNLM", "MultiScaleNLM", "RDFC", "RHF"}
 """Methods whose graph would be hundreds of copies of the same operations."""
 
 

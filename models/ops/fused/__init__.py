@@ -17,6 +17,7 @@ sliced: making a view costs as much as a short row. Compiled code is kept on dis
 from models.ops.fused.cache import kept_apart
 
 with kept_apart():
+    from models.ops.fused.bilateral import filter_scaled as filter_scaled
     from models.ops.fused.filtering import FeatureMaps as FeatureMaps
     from models.ops.fused.filtering import filter_images as filter_images
     from models.ops.fused.histograms import pixel_terms as pixel_terms
