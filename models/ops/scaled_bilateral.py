@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -235,10 +236,9 @@ class _Strip:
 def _summed_fused(pixels: Pixels, scales: Tensor, rule: BilateralRule, slopes: bool) -> Filtered:
     from models.ops import fused
 
-    colors, found = [], []
-    for image in zip(scales, *pixels, strict=True):
-        own, *parts = (x.numpy() for x in image)
-        color, slope = fused.filter_scaled(parts, own, rule, slopes, torch.get_num_threads())
-        colors.append(torch.from_numpy(color))
-        found.append(torch.from_numpy(slope))
-    return Filtered(torch.stack(colors), torch.stack(found) if slopes else None)
+    threads = torch.get_num_threads()
+    images = [[x.numpy() for x in image] for image in zip(scales, *pixels, strict=True)]
+    found = [fused.filter_scaled(parts, own, rule, slopes, threads) for own, *parts in images]
+    color = torch.from_numpy(np.stack([image for image, _ in found]))
+    each = [slope for _, slope in found if slope is not None]
+    return Filtered(color, torch.from_numpy(np.stack(each)) if each else None)

@@ -12,10 +12,10 @@ f with the residual variance v, unfiltered u:
     gradient   the squared gradient of f in 3x3 pixels (`models.ops.joint.squared_gradient`)
 
 each the mean of the group's channels: 7 numbers. The sheet of facts that this follows leaves open how blocks
-lie; decided here is what moves with the image: a block of every pixel, from 4 above and left of it to 3 below
-and right, of which 16 diagonals (a - b - c + d) / 2 of 2x2 pixels are taken; the mean over the pixel and those
-below and right of it centres the blocks. Beyond the border images are mirrored for blocks, and other windows
-lose what lies outside.
+lie; decided here is what moves with the image: every pixel has a block, from 4 above and left of it to 3
+below and right, of which 16 diagonals (a - b - c + d) / 2 of 2x2 pixels are taken; the mean over the pixel
+and those below and right of it brings them back to its centre. Beyond the border images are mirrored for
+blocks, and other windows lose what lies outside.
 """
 
 from __future__ import annotations

@@ -114,6 +114,48 @@ def total(typing_context: Any, a: Any, b: Any) -> Any:
 
 
 @intrinsic
+def quotient(typing_context: Any, a: Any, b: Any) -> Any:
+    """Return a / b."""
+    return vector(vector, vector), lambda context, builder, signature, given: builder.fdiv(*given)
+
+
+@intrinsic
+def smaller(typing_context: Any, a: Any, b: Any) -> Any:
+    """Return the smaller of a and b, b where a is not a number."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", *arguments), *arguments)
+
+    return vector(vector, vector), generate
+
+
+@intrinsic
+def powers_of_two(typing_context: Any, shifted: Any) -> Any:
+    """Return 2**n from 1.5 * 2**23 + n, whose lowest bits are n."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integers = ir.VectorType(ir.IntType(32), LANES)
+        bits = builder.shl(builder.bitcast(arguments[0], integers), ir.Constant(integers, [23] * LANES))
+        bits = builder.add(bits, ir.Constant(integers, [127 << 23] * LANES))
+        return builder.bitcast(bits, _FLOATS)
+
+    return vector(vector), generate
+
+
+@intrinsic
+def below(typing_context: Any, a: Any, limit: Any, values: Any) -> Any:
+    """Return the values where a is below the limit, 0 elsewhere."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        a, limit, values = arguments
+        return builder.select(
+            builder.fcmp_ordered("<", a, limit), values, ir.Constant(_FLOATS, [0.0] * LANES)
+        )
+
+    return vector(vector, vector, vector), generate
+
+
+@intrinsic
 def product_added(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """Return a b + c, rounded once where the machine can."""
 
