@@ -244,7 +244,7 @@ class LBF(Denoiser):
             filtered = scaled_bilateral(self._pixels(color, features), scales, self.rule, self.memory)
             if self.output_spikes is not None:
                 filtered = without_spikes(filtered, 1, self.output_spikes)
-            layers = self._layers(scales, features) if self.aux else None
+            layers = self._layers(buffers, scales, features) if self.aux else None
             return Denoised(filtered / exposure, aux=layers)
 
     def _calm(self, color: Guide, limit: float) -> Guide:
@@ -258,7 +258,7 @@ class LBF(Denoiser):
         a, b = (x.clamp(-_LARGEST, _LARGEST) for x in (a, b))
         variance = variance.clamp(0.0, _LARGEST**2)
         if _is_distance(name):
-            unit = _farthest(0.5 * (a + b), buffers.get("depth_range") if name == "depth" else None)
+            unit = _farthest(0.5 * (a + b), buffers, name)
             a, b, variance = a / unit, b / unit, variance / unit.square()
         if self._is_scaled(name):
             variance = scaled_variance(variance, a, b, _SAMPLED)
@@ -306,17 +306,23 @@ class LBF(Denoiser):
         self.feature_deviation.copy_(torch.where(varies, deviation, 1.0))
         self.measured.fill_(True)
 
-    def _layers(self, scales: Tensor, features: Features) -> dict[str, Tensor]:
+    def _layers(self, buffers: Buffers, scales: Tensor, features: Features) -> dict[str, Tensor]:
         names = ("image", *self.features)
         layers = {f"scale_{n}": scale for n, scale in zip(names, scales.split(1, 1), strict=True)}
-        return layers | {name: guide.image for name, guide in features.groups.items()}
+        for name, guide in features.groups.items():
+            layers[name] = guide.image
+            if _is_distance(name):  # in the unit of the buffer again
+                mean = halves.halves(buffers, name, self.noises[name]).mean
+                layers[name] = guide.image * _farthest(finite(mean), buffers, name)
+        return layers
 
 
 def _is_distance(name: str) -> bool:
     return buffer(name).kind == "distance"
 
 
-def _farthest(distance: Tensor, bounds: Tensor | None) -> Tensor:
-    """Return the largest absolute value of frames, (B, 1, 1, 1), 1 where all are 0; bounds: of the frame."""
+def _farthest(distance: Tensor, buffers: Buffers, name: str) -> Tensor:
+    """Return the largest absolute distance of whole frames, (B, 1, 1, 1), 1 where all are 0."""
+    bounds = buffers.get("depth_range") if name == "depth" else None
     largest = distance.detach().abs().amax((1, 2, 3)) if bounds is None else finite(bounds)[:, 1]
     return torch.where(largest > 0, largest, 1.0).to(distance.dtype)[:, None, None, None]

@@ -198,6 +198,29 @@ def test_the_first_batch_of_a_training_sets_the_normalisation_and_no_other_does(
     assert torch.equal(method.feature_mean, before)
 
 
+def test_all_processes_of_a_training_normalise_by_what_all_of_them_see(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = select(LBF(("albedo",)), training_batch())
+    alone = LBF(("albedo",), **SMALL)
+    alone(whole)
+    sums: list[Tensor] = []
+
+    def reduce(mine: Tensor) -> None:
+        """Keep what the first process sends, and add it to what the second does."""
+        sums.append(mine.clone())
+        mine.copy_(torch.stack(sums).sum(0))
+
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "all_reduce", reduce)
+    for half in (slice(0, 1), slice(1, 2)):
+        method = LBF(("albedo",), **SMALL)
+        method({name: image[half] for name, image in whole.items()})
+    assert len(sums) == 2
+    torch.testing.assert_close(method.feature_mean, alone.feature_mean)
+    torch.testing.assert_close(method.feature_deviation, alone.feature_deviation)
+
+
 def test_a_resumed_training_keeps_its_normalisation() -> None:
     method, batch = LBF(("albedo",), **SMALL), select(LBF(("albedo",)), training_batch())
     method(batch)
@@ -258,6 +281,19 @@ def test_a_firefly_stays_where_it_is_and_its_spike_is_taken_out() -> None:
         calm = LBF(NAMES, **SMALL, sampling="random")(given).color
     assert kept[0, :, 9, 9].min() > 1e4
     assert calm.max() < 100
+
+
+def test_layers_are_the_predictions_and_the_filtered_features_in_their_units() -> None:
+    given = noisy_buffers(1, 16, 18)
+    with torch.no_grad():
+        aux = LBF(NAMES, **SMALL, aux=True)(given).aux
+    assert aux is not None
+    assert list(aux) == ["scale_image", *(f"scale_{name}" for name in NAMES), *NAMES]
+    for name in NAMES:
+        mean = 0.5 * (given[f"{name}_a"] + given[f"{name}_b"])
+        assert aux[name].shape == mean.shape
+        assert (aux[name] - mean).abs().mean() < 0.3 * mean.abs().mean()
+    assert LBF(NAMES, **SMALL)(given).aux is None
 
 
 def test_bfloat16_stays_near_float32() -> None:
