@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -88,6 +89,7 @@ def group_nlm(groups: Sequence[Guide], kernel: GroupKernel, budget: float | None
 def _filtered(joined: Tensor, sizes: list[int], kernel: GroupKernel, share: float) -> Tensor:
     """Filter some rows as an image of their own; share: the part of the image that they are."""
     total, norm = joined.clone(), torch.ones_like(joined[:, : len(sizes)])
+    parts = [slice(*ends) for ends in pairwise(accumulate(2 * sizes, initial=0))]
     height, width = joined.shape[-2:]
     for down in range(kernel.window + 1):
         for right in range(-kernel.window if down else 1, kernel.window + 1):
@@ -97,11 +99,11 @@ def _filtered(joined: Tensor, sizes: list[int], kernel: GroupKernel, share: floa
             one, other = _pair(down, right)
             p, q = joined[one], joined[other]
             weight = _weights(p, q, sizes, kernel)
-            spread = _each_channel(weight, sizes)
-            total[one] += spread * q
-            total[other] += spread * p
-            norm[one] += weight
-            norm[other] += weight
+            for side, neighbours in ((one, q), (other, p)):
+                norm[side] += weight
+                sums = total[side]
+                for k, channels in enumerate(parts):
+                    sums[:, channels].addcmul_(weight[:, k % len(sizes), None], neighbours[:, channels])
     return total / _each_channel(norm, sizes)
 
 

@@ -29,6 +29,7 @@ from torch import Tensor
 from models.ops.boxes import box_sum
 from models.ops.joint import squared_gradient
 from models.ops.nlm import Guide
+from models.ops.sorting import in_order
 from models.ops.spikes import mean_and_deviation
 from models.ops.symmetric import mirrored_border
 
@@ -87,7 +88,7 @@ def _block_medians(padded: Tensor) -> Tensor:
     last = 2 * (_BLOCK - 1)
     rows = [diagonal[..., i : i - last if i < last else None, :] for i in range(0, last + 1, 2)]
     block = [row[..., i : i - last if i < last else None] for row in rows for i in range(0, last + 1, 2)]
-    ordered = torch.stack(block).sort(0).values
+    ordered = in_order(block)
     middle = len(block) // 2
     return 0.5 * (ordered[middle - 1] + ordered[middle])
 

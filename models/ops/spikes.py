@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.boxes import box_sum
+from models.ops.sorting import in_order
 
 
 def without_spikes(image: Tensor, radius: int, limit: float) -> Tensor:
@@ -54,4 +55,4 @@ def median(image: Tensor) -> Tensor:
     padded = F.pad(image, [1] * 4, mode="replicate")
     rows = [padded[..., i : i - 2 if i < 2 else None, :] for i in range(3)]
     near = [row[..., i : i - 2 if i < 2 else None] for row in rows for i in range(3)]
-    return torch.stack(near).sort(0).values[4]
+    return in_order(near)[4]

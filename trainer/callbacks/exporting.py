@@ -14,7 +14,7 @@ class ExportBest(Callback):
     """At the end of `fit`: best checkpoint → ONNX and TorchScript, with parity, into the run.
 
     The model is registered as soon as the tracking store takes it. An export that fails says why and leaves
-    the run as it is; `trainer export` repeats it.
+    the run as it is; `trainer export` repeats it. A denoiser that is never exported stays a checkpoint.
 
     Args:
         formats: What to write; any of `onnx`, `torchscript`.
@@ -37,6 +37,9 @@ class ExportBest(Callback):
         if chosen is None:
             return
         logger.log_file(chosen, "checkpoints")
+        if reason := getattr(getattr(pl_module, "net", None), "no_export", ""):
+            print(f"{chosen} is not exported: {reason}", file=sys.stderr)
+            return
         for format in self.formats:
             self._try(logger, chosen, format)
 
