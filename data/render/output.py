@@ -11,7 +11,7 @@ from typing import Any
 
 from data.ingestion import remove_set
 from data.manifest import MANIFEST, load_manifest, write_json
-from data.render.recipe import Recipe
+from data.render.recipe import ADDITIONS, Recipe
 from data.render.views import WORK, ViewWork
 
 JOB = "job.json"
@@ -25,6 +25,7 @@ _OPTIONS = {
     "chunk": "--memory, samples at once",
     "version": "version of the recipe",
     "histogram": "--histogram",
+    "second_hit": "--second-hit",
 }
 
 
@@ -153,7 +154,8 @@ def _known_recipe(root: Path) -> dict[str, Any] | None:
 
 
 def _difference(recipe: Recipe, known: dict[str, Any]) -> str:
-    mine, known = recipe.to_json() | {"histogram": recipe.histogram}, {"histogram": False, **known}
+    mine = recipe.to_json() | {name: getattr(recipe, name) for name in ADDITIONS}
+    known = dict.fromkeys(ADDITIONS, False) | known
     names = [n for n in mine if n != "reference_spp" and mine[n] != known.get(n)]
     return ", ".join(f"{_OPTIONS[n]} {_plain(known.get(n))} instead of {_plain(mine[n])}" for n in names)
 

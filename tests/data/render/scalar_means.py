@@ -10,7 +10,10 @@ from tests.data.render import scenes
 def main() -> None:
     activate(choose("scalar_rgb"), threads=2)
     tracer = Tracer(scenes.box(8, 8))
-    (chunk,) = tracer.trace(0, 32, 1, ("radiance", "diffuse", "depth", "hit"))
+    names = ("radiance", "diffuse", "depth", "hit")
+    (chunk,) = tracer.trace(0, 32, 1, (*names, "second_albedo"))
+    (without,) = tracer.trace(0, 32, 1, names)
+    assert all(np.array_equal(without.values[name], chunk.values[name]) for name in names)
     (alone,) = tracer.trace(0, 256, 2, ("radiance",))
     (again,) = tracer.trace(0, 256, 2, ("radiance",))
     assert np.array_equal(alone.values["radiance"], again.values["radiance"])
