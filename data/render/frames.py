@@ -134,12 +134,15 @@ def noisy_frames(
 
 def _histograms(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> RayHistograms:
     """Return histograms to fill, exposed as one sample per pixel says that is traced before the others."""
-    image = np.zeros((recipe.height, recipe.width, 3), np.float32)
+    size = (recipe.height, recipe.width)
+    if recipe.histogram_exposure is not None:
+        return RayHistograms(recipe.spp, size, recipe.histogram_exposure)
+    image = np.zeros((*size, 3), np.float32)
     before = tracer.invalid
     for chunk in tracer.trace(view, 1, seed ^ 1, ("radiance",)):
         image[chunk.rows] = chunk.values["radiance"][0]
     tracer.invalid = before
-    return RayHistograms(recipe.spp, image.shape[:2], automatic_exposure(image))
+    return RayHistograms(recipe.spp, size, automatic_exposure(image))
 
 
 def _counted(chunks: Iterator[Any], histograms: RayHistograms | None) -> Iterator[Any]:

@@ -25,6 +25,7 @@ _OPTIONS = {
     "chunk": "--memory, samples at once",
     "version": "version of the recipe",
     "histogram": "--histogram",
+    "histogram_exposure": "--histogram-exposure",
     "second_hit": "--second-hit",
 }
 
@@ -119,7 +120,8 @@ def prepare(root: Path, recipe: Recipe, obstacles: Obstacles) -> None:
 
 def bytes_of(recipe: Recipe, views: int) -> int:
     """Return about how many bytes a data set takes: channels times two or four bytes, less what ZIP saves."""
-    stills = 90 + 60 * recipe.histogram  # most bins are 0, so that ZIP saves half of their four bytes
+    # Most bins are 0, so that ZIP saves half of their four bytes.
+    stills = 90 + 60 * recipe.histogram + 30 * recipe.second_hit
     channels = {"stills": stills, "sequences": 26, "samples": 20 * recipe.spp[0] + 14}[recipe.kind]
     frames = len(recipe.spp) if recipe.kind == "stills" else 1
     sums = 9 * 8
@@ -155,7 +157,7 @@ def _known_recipe(root: Path) -> dict[str, Any] | None:
 
 def _difference(recipe: Recipe, known: dict[str, Any]) -> str:
     mine = recipe.to_json() | {name: getattr(recipe, name) for name in ADDITIONS}
-    known = dict.fromkeys(ADDITIONS, False) | known
+    known = ADDITIONS | known
     names = [n for n in mine if n != "reference_spp" and mine[n] != known.get(n)]
     return ", ".join(f"{_OPTIONS[n]} {_plain(known.get(n))} instead of {_plain(mine[n])}" for n in names)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -55,8 +56,8 @@ SAMPLES = (
 """The radiance and the guides of Munkberg and Hasselgren 2020: 20 numbers."""
 
 
-ADDITIONS = ("histogram", "second_hit")
-"""Options that add buffers of the same samples, and leave the others as they are."""
+ADDITIONS: dict[str, Any] = {"histogram": False, "histogram_exposure": None, "second_hit": False}
+"""Options about buffers that are added, of the same samples, and what they are where nothing is added."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ class Recipe:
         max_depth: Longest path, in segments.
         chunk: Samples traced at once. Larger ones need more memory: about 1 kB per sample.
         histogram: `stills` also have the histogram of each pixel's samples.
+        histogram_exposure: Factor on the radiance that histograms count; None: measured of each view. 1 is
+            radiance as it was rendered, which the authors' program counts.
         second_hit: `stills` also have the albedo of the second hits, and halves and variance of positions.
     """
 
@@ -83,6 +86,7 @@ class Recipe:
     max_depth: int = 8
     chunk: int = 2**20
     histogram: bool = False
+    histogram_exposure: float | None = None
     second_hit: bool = False
 
     def __post_init__(self) -> None:
@@ -105,6 +109,13 @@ class Recipe:
         if self.histogram and self.kind != "stills":
             follows = ": their histograms follow from their samples" if self.kind == "samples" else ""
             raise ValueError(f"--histogram is for stills, not {self.kind}{follows}; leave it out")
+        if self.histogram_exposure is not None:
+            if not self.histogram:
+                raise ValueError("--histogram-exposure is for --histogram: give both, or leave it out")
+            if not 0 < self.histogram_exposure < math.inf:
+                raise ValueError(
+                    f"--histogram-exposure {self.histogram_exposure}: expected a positive number"
+                )
         if self.second_hit and self.kind != "stills":
             raise ValueError(f"--second-hit is for stills, not {self.kind}; leave it out")
         if self.reference_spp < 2:
@@ -145,12 +156,14 @@ class Recipe:
         So a recipe without them is what it was before there were any.
         """
         values = {**asdict(self), "spp": list(self.spp), "version": RECIPE_VERSION}
-        return {name: value for name, value in values.items() if name not in ADDITIONS or value}
+        return {
+            name: value for name, value in values.items() if name not in ADDITIONS or value != ADDITIONS[name]
+        }
 
     def same_work(self, other: dict[str, Any]) -> bool:
         """Return whether a manifest's recipe is this one but for the samples of the reference."""
         mine = {**self.to_json(), "reference_spp": other.get("reference_spp")}
-        same = all(bool(other.get(name)) == getattr(self, name) for name in ADDITIONS)
+        same = all(other.get(name, without) == getattr(self, name) for name, without in ADDITIONS.items())
         return same and all(other.get(name) == value for name, value in mine.items())
 
 
@@ -185,7 +198,7 @@ def stream_key(identity: dict[str, Any], frame: int, recipe: Recipe) -> str:
 
     It is the key of the view without additions: whoever renders again with them gets the same samples.
     """
-    return view_key(identity, frame, replace(recipe, histogram=False, second_hit=False))
+    return view_key(identity, frame, replace(recipe, **ADDITIONS))
 
 
 def seed_of(key: str, role: str, number: int = 0) -> int:

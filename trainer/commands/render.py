@@ -95,6 +95,13 @@ def _image_arguments(group: Any) -> None:
         help="stills also have the histogram of each pixel's samples, which RHF reads: 60 more channels",
     )
     group.add_argument(
+        "--histogram-exposure",
+        metavar="X",
+        type=float,
+        help="factor on the radiance that histograms count (default: measured of each view, so that their "
+        "bins fit its brightness; 1 as the program of RHF's authors)",
+    )
+    group.add_argument(
         "--second-hit",
         action="store_true",
         help="stills also have the albedo of what paths hit second, and halves and variance of positions, "
@@ -223,6 +230,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         max_depth=args.max_depth,
         chunk=chunk,
         histogram=args.histogram,
+        histogram_exposure=args.histogram_exposure,
         second_hit=args.second_hit,
     )
 

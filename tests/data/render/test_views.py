@@ -348,3 +348,31 @@ def test_the_seeds_of_a_view_follow_from_its_stream():
     plain = ViewWork(None, "fake", 0, "k", STILLS)
     assert plain.seed("input") == seed_of("k", "input")
     assert replace(plain, stream="s").seed("reference", 64) == seed_of("s", "reference", 64)
+
+
+def test_histograms_of_radiance_as_it_was_rendered_can_be_asked_for(tmp_path):
+    asked = with_options(STILLS, histogram=True, histogram_exposure=1.0)
+    tracer = FakeTracer(chunk=2**14, scale=50.0)
+    (chunk,) = FakeTracer(chunk=2**14, scale=50.0).trace(0, 4, seed_of("k", "input"), asked.names)
+    done = work(tmp_path, asked)
+    render(done, tracer)
+    assert [spp for _, spp, _ in tracer.calls] == [4, 64], "no sample is needed to measure an exposure"
+    last = records(done)[-1]
+    found = read_frame(tmp_path / last.file).buffers["histogram"]
+    assert np.allclose(found, sample_histogram(chunk.values["radiance"]), atol=1e-5)
+    assert last.checks["histogram_exposure"] == 1
+    assert not asked.same_work(with_options(STILLS, histogram=True).to_json())
+    assert not with_options(STILLS, histogram=True).same_work(asked.to_json())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"histogram_exposure": 1.0}, "--histogram-exposure is for --histogram"),
+        ({"histogram": True, "histogram_exposure": 0.0}, "--histogram-exposure 0.0: expected a positive"),
+        ({"histogram": True, "histogram_exposure": float("nan")}, "expected a positive number"),
+    ],
+)
+def test_exposures_of_histograms_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        with_options(STILLS, **options)
