@@ -9,6 +9,7 @@ from tests.data.render.scenes import trace
 
 MIRROR = {"type": "conductor", "material": "none"}
 RED = [0.6, 0.1, 0.25]
+BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}}
 
 
 def diffuse(colour):
@@ -53,8 +54,7 @@ def test_paths_that_leave_the_scene_have_no_second_hit():
 
 
 def test_black_surfaces_end_paths_before_a_second_hit():
-    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}}
-    values = trace(facing(diffuse(RED), black), "second_albedo", "hit", spp=4)
+    values = trace(facing(diffuse(RED), BLACK), "second_albedo", "hit", spp=4)
     assert values["hit"].max() == 1
     assert (values["second_albedo"] == 0).all()
 
