@@ -60,6 +60,15 @@ HISTOGRAM_MADE = (
 )
 """Where the buffer comes from, which few frames have."""
 
+SECOND_ALBEDO = "second_albedo"
+"""Name of the buffer with the reflectance of the second hits."""
+
+SECOND_HIT_MADE = (
+    "trainer render stills --second-hit writes the albedo of the second hit, with halves and variance, and "
+    "those of the position"
+)
+"""Where `second_albedo` and `position_variance` come from, which few frames have."""
+
 _PLAIN = (
     _radiance("color", "Noisy radiance, with albedo."),
     _radiance(
@@ -106,6 +115,20 @@ _PLAIN = (
         True,
         "no_hit",
         "Specular reflectance of the first hit at normal incidence, 0 for diffuse surfaces.",
+    ),
+    Buffer(
+        SECOND_ALBEDO,
+        3,
+        "RGB",
+        "ratio",
+        "reflectance",
+        0.0,
+        1.0,
+        0.0,
+        True,
+        "no_hit",
+        "Diffuse plus specular reflectance, at most 1, of what each path hits second; 0 where it left the "
+        "scene or ended before.",
     ),
     Buffer(
         "normal",

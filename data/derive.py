@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data import camera as cameras
-from data.buffers import BUFFERS, HISTOGRAM, HISTOGRAM_MADE
+from data.buffers import BUFFERS, HISTOGRAM, HISTOGRAM_MADE, SECOND_ALBEDO, SECOND_HIT_MADE
 from data.camera import Camera, DepthKind
 from data.dropped import mean as mean_of_samples
 from data.frame import Frame, Image, Samples
@@ -195,6 +195,12 @@ def sources(names: Iterable[str], has: Collection[str]) -> set[str]:
     return found
 
 
+_OF_SECOND_HITS = frozenset(
+    {SECOND_ALBEDO, *(f"{n}_{part}" for n in (SECOND_ALBEDO, "position") for part in ("a", "b", "variance"))}
+)
+"""Buffers that one option of `trainer render` writes."""
+
+
 class _Context:
     """One call of `derive`: the growing frame and the parameters of its rules."""
 
@@ -229,7 +235,8 @@ class _Context:
 
     def _rule(self, name: str) -> tuple[Image, str]:
         if name not in self.rules:
-            self.frame.require(name)
+            hint = SECOND_HIT_MADE if name in _OF_SECOND_HITS else ""
+            self.frame.require(name, hint=hint)
         return self.rules[name]()
 
     def _of_halves(self, name: str) -> tuple[Image, str] | None:

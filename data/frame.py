@@ -148,12 +148,13 @@ class Frame:
                 f"{self.label}: samples are {width}x{height}, the buffers {self.width}x{self.height}"
             )
 
-    def require(self, *names: str) -> None:
-        """Raise a ValueError that names the missing buffers, unless all are there."""
+    def require(self, *names: str, hint: str = "") -> None:
+        """Raise a ValueError that names the missing buffers, unless all are there; a hint ends it."""
         missing = [name for name in names if name not in self.buffers]
         if missing:
             raise ValueError(
                 f"{self.label}: missing buffer {', '.join(missing)}; it has {', '.join(self.buffers)}"
+                f"{hint and f'; {hint}'}"
             )
 
     def with_buffers(self, **changes: Image) -> Frame:

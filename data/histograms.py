@@ -11,7 +11,7 @@ channel, split between the two bins that its place lies between:
 So 19 bins are spaced evenly up to radiance 2.5^2.2 = 7.5, and the last one tells how far beyond that a sample
 lies, up to 34.5. The weight of the pixel filter is 1: samples belong to one pixel (box filter). The released
 code takes radiance as it is rendered, here it is exposed first, since 7.5 means something only where scenes
-are scaled alike.
+are scaled alike; `trainer render stills --histogram --histogram-exposure 1` does as the code does.
 """
 
 from __future__ import annotations

@@ -43,6 +43,7 @@ from torch.utils.checkpoint import checkpoint
 from models.denoiser import Buffers, Denoised, Denoiser, Pair
 from models.ops.boxes import exporting
 from models.ops.guides import depth_range, divisor, finite, relative_depth, unit_normal
+from models.ops.memory_format import innermost
 from models.ops.modulation import SLOPE, Weights, modulated_convolution, plain_modulated_convolution
 from models.ops.precision import wide
 from models.ops.tonemap import exposed, radiance_of
@@ -249,8 +250,8 @@ class ACFM(Denoiser):
         if self.normal_range == "published":
             raw_normals = torch.cat([guides[:, :3] * 2.0 - 1.0, guides[:, 3:]], 1)
         return Logs(
-            self.diffuse(_inner(noisy.diffuse), _inner(raw_normals)),
-            self.specular(_inner(noisy.specular), _inner(guides)),
+            self.diffuse(innermost(noisy.diffuse), innermost(raw_normals)),
+            self.specular(innermost(noisy.specular), innermost(guides)),
         )
 
     def training_pairs(self, batch: Mapping[str, Any]) -> dict[str, Pair]:
@@ -301,8 +302,3 @@ class ACFM(Denoiser):
 def _check_choice(name: str, value: str, known: tuple[str, str]) -> None:
     if value not in known:
         raise ValueError(f"{name} must be {known[0]!r} or {known[1]!r}, got {value!r}")
-
-
-def _inner(maps: Tensor) -> Tensor:
-    """Put the channels innermost: the convolutions and the modulations are faster there."""
-    return maps if torch.compiler.is_exporting() else maps.contiguous(memory_format=torch.channels_last)

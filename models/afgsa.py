@@ -47,6 +47,7 @@ from models.blocks.reflect_conv import ReflectConv
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.boxes import exporting
 from models.ops.guides import depth_range, finite, relative_depth, unit_normal
+from models.ops.memory_format import innermost
 from models.ops.padding import padded
 from models.ops.reflect_conv import pointwise
 from models.ops.tonemap import exposed, radiance_of
@@ -196,8 +197,7 @@ class AFGSA(Denoiser):
 
     def _padded(self, images: Tensor) -> Tensor:
         images = padded(images, self.multiple)
-        # Convolutions with many channels and matrix products both want channels innermost.
-        return images if exporting() else images.contiguous(memory_format=torch.channels_last)
+        return innermost(images)
 
     def _extract(self, noisy: Tensor, aux: Tensor | None) -> tuple[Tensor, Tensor | None]:
         recomputed = self.checkpointed > 0

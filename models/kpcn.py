@@ -52,6 +52,7 @@ from models.ops.boxes import exporting
 from models.ops.gather import Border, gather_padded, pad_border, strips
 from models.ops.gradients import backward_differences
 from models.ops.guides import depth_range, divisor, farthest, finite, relative_depth
+from models.ops.memory_format import innermost
 from models.ops.precision import wide
 from models.ops.tonemap import LARGEST, exposed, radiance_of
 
@@ -115,9 +116,7 @@ class Branch(nn.Module):
 
     def _hidden(self, features: Tensor) -> Tensor:
         """Return what the last convolution reads, with the 2 pixels that it needs on each side."""
-        hidden = F.pad(features, [self.reach] * 4) if self.once else features
-        if not exporting():
-            hidden = hidden.contiguous(memory_format=torch.channels_last)
+        hidden = innermost(F.pad(features, [self.reach] * 4) if self.once else features)
         for convolution in self.convolutions[:-1]:
             hidden = F.relu_(convolution(hidden))
         return hidden if self.once else F.pad(hidden, [SIZE // 2] * 4)

@@ -51,9 +51,9 @@ from torch import Tensor, nn
 
 from models.blocks.average_unet import AverageUNet
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
-from models.ops.boxes import exporting
 from models.ops.gather_inside import gather_inside
 from models.ops.gather_positive import gather_positive
+from models.ops.memory_format import innermost
 from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.resolutions import Upsampling, blended, resolutions
@@ -202,10 +202,7 @@ class MRKP(Denoiser):
         """
         self.check(buffers)
         maps = padded(ten_channels(buffers, self.exposure(buffers), _CURVES[self.color]), self.multiple)
-        if not exporting():
-            # oneDNN and cuDNN convolve faster with channels innermost.
-            maps = maps.contiguous(memory_format=torch.channels_last)
-        *finer, coarsest = (self._level(made) for made in self.unet(maps))
+        *finer, coarsest = (self._level(made) for made in self.unet(innermost(maps)))
         return [*finer, coarsest if self.raw_level else coarsest._replace(alpha=None)]
 
     def training_pairs(self, batch: Mapping[str, Any]) -> dict[str, Pair]:

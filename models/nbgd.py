@@ -42,6 +42,7 @@ from models.denoiser import Buffers, Denoised, Denoiser, Pair, select
 from models.ops.bilateral_grid import create_grid, slice_grid
 from models.ops.grid_cells import LEVELS, Cells
 from models.ops.guides import depth_range, finite
+from models.ops.memory_format import innermost
 from models.ops.outliers import replace_outliers
 from models.ops.padding import padded
 from models.ops.precision import wide
@@ -189,9 +190,7 @@ class NBGD(Denoiser):
         return ten_channels(clean, clean["exposure"], self._toned)
 
     def _guides(self, maps: Tensor) -> Guides:
-        if not torch.compiler.is_exporting():
-            # Few channels are convolved about twice as fast with channels innermost.
-            maps = maps.contiguous(memory_format=torch.channels_last)
+        maps = innermost(maps)
         first, *dense, last = (cast(nn.Conv2d, layer) for layer in self.convolutions)
         maps = F.leaky_relu(first(maps), SLOPE, inplace=True)
         for layer in dense:

@@ -42,6 +42,7 @@ from data.buffers import buffer
 from models.denoiser import Buffers, Denoised, Denoiser, Pair, State, select
 from models.ops.boxes import exporting
 from models.ops.guides import finite
+from models.ops.memory_format import innermost
 from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.ten_channels import depth_bounds, scaled_depth
@@ -192,10 +193,7 @@ class RAE(Denoiser):
     def _toned(self, buffers: Buffers, state: State | None) -> tuple[Tensor, State]:
         """Return e (B, 3, H, W) and the next state."""
         height, width = self.check(buffers)[1:]
-        maps = padded(self._channels(buffers), self.multiple)
-        if not exporting():
-            # oneDNN and cuDNN convolve faster with channels innermost.
-            maps = maps.contiguous(memory_format=torch.channels_last)
+        maps = innermost(padded(self._channels(buffers), self.multiple))
         self._check_state(state, maps)
         maps, hidden = _active(self.enter(maps)), {}
         for level, stage in enumerate(self.encoder):

@@ -34,8 +34,8 @@ from torch import Tensor
 
 from models.blocks.average_unet import AverageUNet
 from models.denoiser import Buffers, Denoised, Denoiser
-from models.ops.boxes import exporting
 from models.ops.kernel_views import VIEWS_BYTES, full_size, kernel_views
+from models.ops.memory_format import innermost
 from models.ops.padding import padded
 from models.ops.precision import wide
 from models.ops.resolutions import blended, resolutions
@@ -147,10 +147,7 @@ class MultiResolutionWSKP(Denoiser):
         """
         self.check(buffers)
         maps = padded(ten_channels(buffers, self.exposure(buffers), CURVES[self.curve]), self.multiple)
-        if not exporting():
-            # oneDNN and cuDNN convolve faster with channels innermost.
-            maps = maps.contiguous(memory_format=torch.channels_last)
-        *finer, coarsest = (self._level(made) for made in self.unet(maps))
+        *finer, coarsest = (self._level(made) for made in self.unet(innermost(maps)))
         return [*finer, coarsest._replace(alpha=None)]
 
     def measure(self, buffers: Buffers) -> dict[str, Tensor]:

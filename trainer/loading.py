@@ -191,7 +191,9 @@ def _from_training(checkpoint: dict[str, Any], path: Path, source: Source) -> tu
     except (TypeError, AttributeError, ArithmeticError, LookupError, RuntimeError, ValueError) as error:
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
     _fill(denoiser, weights, path)
-    return denoiser, replace(source, class_path=class_path, init_args=arguments)
+    step = checkpoint.get("global_step")
+    trained = step if isinstance(step, int) else None
+    return denoiser, replace(source, class_path=class_path, init_args=arguments, step=trained)
 
 
 def _outline(class_path: str, arguments: dict[str, Any]) -> Denoiser | None:

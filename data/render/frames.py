@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from data.buffers import HISTOGRAM
+from data.buffers import HISTOGRAM, SECOND_ALBEDO
 from data.camera import Camera
 from data.derive import automatic_exposure
 from data.frame import Frame, Image, Samples
@@ -27,7 +27,14 @@ HALVES = (
     "depth",
     "visibility",
 )
-"""Quantities of stills that are stored with two halves and the variance of the mean."""
+"""Quantities of stills that are stored with two halves and the variance of the mean.
+
+Rays that left the scene count as 0 in them, so that a pixel with surface and background has a high variance;
+the mean of depth and position is that over the rays that hit.
+"""
+
+SECOND_HIT = ("position", SECOND_ALBEDO)
+"""The same of a recipe with second hits."""
 
 FOLLOWING = ("color", "specular", "specular_a", "specular_b")
 """Buffers of stills that are left out, since they follow from others: specular is color - diffuse."""
@@ -115,7 +122,7 @@ def noisy_frames(
     histograms = _histograms(tracer, view, recipe, seed) if recipe.histogram else None
     stream = ((chunk.rows, _with_specular(chunk.values)) for chunk in _counted(chunks, histograms))
     for level, (count, moments) in enumerate(at_counts(stream, recipe.spp, (recipe.height, recipe.width))):
-        buffers = _still(moments) if recipe.kind == "stills" else _means(moments)
+        buffers = _still(moments, recipe.second_hit) if recipe.kind == "stills" else _means(moments)
         frame = _frame(tracer, view, view * len(recipe.spp) + level, count, buffers)
         if len(recipe.spp) > 1 or not spec.path:
             frame.notes["view"] = view
@@ -127,12 +134,15 @@ def noisy_frames(
 
 def _histograms(tracer: Tracing, view: int, recipe: Recipe, seed: int) -> RayHistograms:
     """Return histograms to fill, exposed as one sample per pixel says that is traced before the others."""
-    image = np.zeros((recipe.height, recipe.width, 3), np.float32)
+    size = (recipe.height, recipe.width)
+    if recipe.histogram_exposure is not None:
+        return RayHistograms(recipe.spp, size, recipe.histogram_exposure)
+    image = np.zeros((*size, 3), np.float32)
     before = tracer.invalid
     for chunk in tracer.trace(view, 1, seed ^ 1, ("radiance",)):
         image[chunk.rows] = chunk.values["radiance"][0]
     tracer.invalid = before
-    return RayHistograms(recipe.spp, image.shape[:2], automatic_exposure(image))
+    return RayHistograms(recipe.spp, size, automatic_exposure(image))
 
 
 def _counted(chunks: Iterator[Any], histograms: RayHistograms | None) -> Iterator[Any]:
@@ -164,10 +174,10 @@ def _means(moments: Mapping[str, Moments]) -> dict[str, Image]:
     }
 
 
-def _still(moments: Mapping[str, Moments]) -> dict[str, Image]:
+def _still(moments: Mapping[str, Moments], second_hit: bool) -> dict[str, Image]:
     """Return means, halves and variances, without those that follow from others."""
     buffers = _means(moments)
-    for name in HALVES:
+    for name in (*HALVES, *SECOND_HIT) if second_hit else HALVES:
         stored = _NAMES.get(name, name)
         for half in "ab":
             buffers[f"{stored}_{half}"] = moments[name].half(half)

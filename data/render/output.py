@@ -11,7 +11,7 @@ from typing import Any
 
 from data.ingestion import remove_set
 from data.manifest import MANIFEST, load_manifest, write_json
-from data.render.recipe import Recipe
+from data.render.recipe import ADDITIONS, Recipe
 from data.render.views import WORK, ViewWork
 
 JOB = "job.json"
@@ -25,6 +25,8 @@ _OPTIONS = {
     "chunk": "--memory, samples at once",
     "version": "version of the recipe",
     "histogram": "--histogram",
+    "histogram_exposure": "--histogram-exposure",
+    "second_hit": "--second-hit",
 }
 
 
@@ -118,7 +120,8 @@ def prepare(root: Path, recipe: Recipe, obstacles: Obstacles) -> None:
 
 def bytes_of(recipe: Recipe, views: int) -> int:
     """Return about how many bytes a data set takes: channels times two or four bytes, less what ZIP saves."""
-    stills = 90 + 60 * recipe.histogram  # most bins are 0, so that ZIP saves half of their four bytes
+    # Most bins are 0, so that ZIP saves half of their four bytes.
+    stills = 90 + 60 * recipe.histogram + 30 * recipe.second_hit
     channels = {"stills": stills, "sequences": 26, "samples": 20 * recipe.spp[0] + 14}[recipe.kind]
     frames = len(recipe.spp) if recipe.kind == "stills" else 1
     sums = 9 * 8
@@ -153,7 +156,8 @@ def _known_recipe(root: Path) -> dict[str, Any] | None:
 
 
 def _difference(recipe: Recipe, known: dict[str, Any]) -> str:
-    mine, known = recipe.to_json() | {"histogram": recipe.histogram}, {"histogram": False, **known}
+    mine = recipe.to_json() | {name: getattr(recipe, name) for name in ADDITIONS}
+    known = ADDITIONS | known
     names = [n for n in mine if n != "reference_spp" and mine[n] != known.get(n)]
     return ", ".join(f"{_OPTIONS[n]} {_plain(known.get(n))} instead of {_plain(mine[n])}" for n in names)
 

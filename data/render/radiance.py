@@ -26,11 +26,14 @@ class Split:
         radiance: All of it, RGB.
         diffuse: What left the first hit through its diffuse lobes, and the first hit's emission, RGB.
         visibility: 1 where the first hit's light sample is not occluded.
+        second_albedo: Diffuse plus specular reflectance of the second hit, at most 1, RGB; 0 where there is
+            none. None unless it was asked for.
     """
 
     radiance: Any
     diffuse: Any
     visibility: Any
+    second_albedo: Any = None
 
 
 class Radiance:
@@ -55,24 +58,27 @@ class Radiance:
 
         return self.path.sample(self._scene, sampler, mitsuba.RayDifferential3f(ray))[0]
 
-    def split(self, sampler: Any, si: Any) -> Split:
+    def split(self, sampler: Any, si: Any, second: bool = False) -> Split:
         """Return the radiance that leaves first hits towards the camera.
 
         Args:
             sampler: Source of random numbers.
             si: `mitsuba.SurfaceInteraction3f` of the camera rays.
+            second: Return the reflectance of the second hits too; it takes no random numbers.
         """
         import mitsuba
 
         emission = self._emission(si, True)
         valid = si.is_valid()
         if self._scalar and not valid:
-            return Split(emission, emission, 0.0)
+            nothing = mitsuba.Color3f(0.0) if second else None
+            return Split(emission, emission, 0.0, nothing)
         bsdf = si.bsdf()
         direct, direct_diffuse, visibility = self._direct(sampler, si, bsdf, valid)
-        indirect, indirect_diffuse = self._indirect(sampler, si, bsdf, valid)
+        indirect, indirect_diffuse, following, alive = self._indirect(sampler, si, bsdf, valid)
         diffuse = mitsuba.Color3f(emission + direct_diffuse + indirect_diffuse)
-        return Split(emission + direct + indirect, diffuse, visibility)
+        albedo = self._reflectance(following, alive) if second else None
+        return Split(emission + direct + indirect, diffuse, visibility, albedo)
 
     def _emission(self, si: Any, active: Any) -> Any:
         import mitsuba
@@ -101,8 +107,8 @@ class Radiance:
         part = self._materials.diffuse_value(bsdf, si, wo, value, smooth)
         return value * incident, part * incident, drjit.select(visible, mitsuba.Float(1.0), 0.0)
 
-    def _indirect(self, sampler: Any, si: Any, bsdf: Any, active: Any) -> tuple[Any, Any]:
-        """Return a BSDF sample's contribution and its diffuse part."""
+    def _indirect(self, sampler: Any, si: Any, bsdf: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Return a BSDF sample's contribution, its diffuse part, what it hits, and whether it is alive."""
         import drjit
         import mitsuba
 
@@ -119,7 +125,19 @@ class Radiance:
         incident = drjit.maximum(beyond - emitted, 0.0) + weight * emitted
         result = drjit.select(alive, throughput * incident, mitsuba.Color3f(0.0))
         share = self._diffuse_share(bsdf, si, sample.wo, alive & (delta ^ True))
-        return result, result * share
+        return result, result * share, following, alive
+
+    def _reflectance(self, si: Any, active: Any) -> Any:
+        """Return the diffuse plus the specular reflectance of hits in [0, 1], RGB, 0 without a hit."""
+        import drjit
+        import mitsuba
+
+        hit = active & si.is_valid()
+        if self._scalar and not hit:  # nothing has no material that could be asked
+            return mitsuba.Color3f(0.0)
+        bsdf = si.bsdf()
+        total = self._materials.albedo(bsdf, si, hit) + self._materials.specular(bsdf, si, hit)
+        return drjit.minimum(total, mitsuba.Color3f(1.0))
 
     def _light_density(self, following: Any, si: Any, active: Any) -> Any:
         """Return the density with which a light sample of `si` would have found the next vertex."""

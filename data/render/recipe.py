@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
+
+from data.buffers import SECOND_ALBEDO
 
 Kind = Literal["stills", "sequences", "samples"]
 
@@ -53,6 +56,10 @@ SAMPLES = (
 """The radiance and the guides of Munkberg and Hasselgren 2020: 20 numbers."""
 
 
+ADDITIONS: dict[str, Any] = {"histogram": False, "histogram_exposure": None, "second_hit": False}
+"""Options about buffers that are added, of the same samples, and what they are where nothing is added."""
+
+
 @dataclass(frozen=True)
 class Recipe:
     """What is rendered of every view.
@@ -66,6 +73,9 @@ class Recipe:
         max_depth: Longest path, in segments.
         chunk: Samples traced at once. Larger ones need more memory: about 1 kB per sample.
         histogram: `stills` also have the histogram of each pixel's samples.
+        histogram_exposure: Factor on the radiance that histograms count; None: measured of each view. 1 is
+            radiance as it was rendered, which the authors' program counts.
+        second_hit: `stills` also have the albedo of the second hits, and halves and variance of positions.
     """
 
     kind: Kind
@@ -76,6 +86,8 @@ class Recipe:
     max_depth: int = 8
     chunk: int = 2**20
     histogram: bool = False
+    histogram_exposure: float | None = None
+    second_hit: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -97,6 +109,15 @@ class Recipe:
         if self.histogram and self.kind != "stills":
             follows = ": their histograms follow from their samples" if self.kind == "samples" else ""
             raise ValueError(f"--histogram is for stills, not {self.kind}{follows}; leave it out")
+        if self.histogram_exposure is not None:
+            if not self.histogram:
+                raise ValueError("--histogram-exposure is for --histogram: give both, or leave it out")
+            if not 0 < self.histogram_exposure < math.inf:
+                raise ValueError(
+                    f"--histogram-exposure {self.histogram_exposure}: expected a positive number"
+                )
+        if self.second_hit and self.kind != "stills":
+            raise ValueError(f"--second-hit is for stills, not {self.kind}; leave it out")
         if self.reference_spp < 2:
             raise ValueError(f"--reference-spp {self.reference_spp}: expected at least 2")
         if self.max_depth < 2:
@@ -117,7 +138,8 @@ class Recipe:
     @property
     def names(self) -> tuple[str, ...]:
         """Quantities of the noisy samples."""
-        return {"stills": STILLS, "sequences": SEQUENCES, "samples": SAMPLES}[self.kind]
+        names = {"stills": STILLS, "sequences": SEQUENCES, "samples": SAMPLES}[self.kind]
+        return (*names, SECOND_ALBEDO) if self.second_hit else names
 
     @property
     def reference_names(self) -> tuple[str, ...]:
@@ -129,16 +151,19 @@ class Recipe:
         return self.pixels * (self.spp[-1] + self.reference_spp)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for the manifest; without histograms it is what it was before there were any."""
+        """Return plain data for the manifest; additions that are not asked for are not in it.
+
+        So a recipe without them is what it was before there were any.
+        """
         values = {**asdict(self), "spp": list(self.spp), "version": RECIPE_VERSION}
-        if not self.histogram:
-            del values["histogram"]
-        return values
+        return {
+            name: value for name, value in values.items() if name not in ADDITIONS or value != ADDITIONS[name]
+        }
 
     def same_work(self, other: dict[str, Any]) -> bool:
         """Return whether a manifest's recipe is this one but for the samples of the reference."""
         mine = {**self.to_json(), "reference_spp": other.get("reference_spp")}
-        same = bool(other.get("histogram")) == self.histogram
+        same = all(other.get(name, without) == getattr(self, name) for name, without in ADDITIONS.items())
         return same and all(other.get(name) == value for name, value in mine.items())
 
 
@@ -166,6 +191,14 @@ def view_key(identity: dict[str, Any], frame: int, recipe: Recipe) -> str:
     kept = {name: value for name, value in recipe.to_json().items() if name != "reference_spp"}
     job = json.dumps({"scene": identity, "frame": frame, "recipe": kept}, sort_keys=True)
     return hashlib.sha256(job.encode()).hexdigest()[:24]
+
+
+def stream_key(identity: dict[str, Any], frame: int, recipe: Recipe) -> str:
+    """Return the hash that the seeds of a view follow from.
+
+    It is the key of the view without additions: whoever renders again with them gets the same samples.
+    """
+    return view_key(identity, frame, replace(recipe, **ADDITIONS))
 
 
 def seed_of(key: str, role: str, number: int = 0) -> int:

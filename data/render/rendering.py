@@ -13,7 +13,7 @@ from data.jobs import elsewhere
 from data.manifest import MANIFEST, FrameRecord, Manifest, SceneRecord, make_splits, write_json
 from data.render.output import bytes_of, check_room, examine, prepare
 from data.render.pool import measure_speed, tasks_of, work_on
-from data.render.recipe import Recipe, view_key
+from data.render.recipe import Recipe, stream_key, view_key
 from data.render.sources import Source
 from data.render.variant import Variant
 from data.render.views import WORK, ViewWork
@@ -136,7 +136,9 @@ def _works(sources: Sequence[Source], recipe: Recipe, root: Path) -> dict[str, l
         if name in works:
             raise ValueError(f"two scenes are called {name!r}; a file's name must be unique")
         works[name] = [
-            ViewWork(root, name, view, view_key(identity, view, recipe), recipe)
+            ViewWork(
+                root, name, view, view_key(identity, view, recipe), recipe, stream_key(identity, view, recipe)
+            )
             for view in range(source.shot.frames)
         ]
         same = keys.setdefault(works[name][0].key, name)

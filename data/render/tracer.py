@@ -29,7 +29,8 @@ from data.render.variant import is_scalar
 
 __all__ = ["GUIDES", "NAMES", "SLICES", "Chunk", "Tracer", "view_world_to_pixel"]
 
-RADIANCE = ("radiance", "diffuse", "visibility")
+SPLIT = ("diffuse", "visibility", "second_albedo")
+RADIANCE = ("radiance", *SPLIT)
 NAMES = (*RADIANCE, *GUIDES)
 SLICES = 16
 _CHANNELS = {"depth": 1, "roughness": 1, "hit": 1, "visibility": 1, "coc": 1, "time": 1} | {
@@ -129,7 +130,8 @@ class Tracer:
             spp: Samples per pixel.
             seed: Other seeds give independent samples.
             names: Quantities, out of `NAMES`. `normal` is flipped to the viewer; `depth` is the distance
-                from the camera's centre at the middle of the shutter; `lens` is 0 for pinhole cameras.
+                from the camera's centre at the middle of the shutter; `lens` is 0 for pinhole cameras;
+                `second_albedo` leaves all others as they are without it.
             motion: `previous`: pixel of the same point in the previous frame's view minus the one in this
                 view, 0 at frame 0 and between views that are no path; the background counts as infinitely
                 far. `shutter`: how far the point moves over this frame's shutter. Both in pixels.
@@ -301,7 +303,7 @@ class Tracer:
         wanted = [name for name in setting.names if name in GUIDES]
         values = setting.guides.of(samples, wanted)
         if setting.split:
-            split = self._radiance.split(self._sampler, si)
+            split = self._radiance.split(self._sampler, si, "second_albedo" in setting.names)
             values |= {name: getattr(split, name) for name in setting.names if name in RADIANCE}
         elif "radiance" in setting.names:
             values["radiance"] = self._radiance.whole(self._sampler, ray)
@@ -316,7 +318,7 @@ class Tracer:
         view = self._view(frame)
         previous = self._view(frame - 1) if frame > 0 and self.spec.path else None
         guides = Guides(self._loaded, self._materials, (view, previous), motion)
-        split = "diffuse" in names or "visibility" in names
+        split = any(name in names for name in SPLIT)
         return _Frame(view, sensor(view), guides, names, split, static or not self._loaded.moving)
 
     def _view(self, frame: int) -> View:

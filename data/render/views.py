@@ -36,6 +36,7 @@ class ViewWork:
         view: Number of the view.
         key: Hash of everything that decides its pixels.
         recipe: What is rendered.
+        stream: Hash that its seeds follow from; empty: `key`.
     """
 
     root: Path
@@ -43,6 +44,11 @@ class ViewWork:
     view: int
     key: str
     recipe: Recipe
+    stream: str = ""
+
+    def seed(self, role: str, number: int = 0) -> int:
+        """Return the seed of a role; see `data.render.recipe.seed_of`."""
+        return seed_of(self.stream or self.key, role, number)
 
     @property
     def memory(self) -> Path:
@@ -90,7 +96,7 @@ def render_view(work: ViewWork, tracer: Tracing, renderer: str, report: Report) 
     memory = work.remembered()
     recipe = work.recipe
     if memory is None:
-        frames = noisy_frames(tracer, work.view, recipe, seed_of(work.key, "input"), report)
+        frames = noisy_frames(tracer, work.view, recipe, work.seed("input"), report)
         records = [_write(work, frame) for frame in frames]
         memory = _remember(work, tracer.spec, renderer, records, 0)
     reference = Reference.load(work.sums, recipe.height, recipe.width, recipe.kind == "stills")
@@ -109,7 +115,7 @@ def add_pass(reference: Reference, tracer: Tracing, work: ViewWork, report: Repo
     one that was rendered at once.
     """
     spp = min(work.recipe.pass_spp, work.recipe.reference_spp - reference.count)
-    seed = seed_of(work.key, "reference", reference.count)
+    seed = work.seed("reference", reference.count)
     static = work.recipe.kind == "sequences"
     before = tracer.invalid
     chunks = tracer.trace(work.view, spp, seed, work.recipe.reference_names, static=static)

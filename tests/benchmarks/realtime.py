@@ -10,19 +10,18 @@ sequence, which costs what the others cost; nothing of it is a reconstruction.
 
 "paper" is the published ratio or time, on an RTX 2080 Ti with operators written in CUDA (ONND: Titan X).
 
-Where the order differs from the paper's, and why, as measured at 640x368 on two cores that had other work
-too (quotients to WSKP with six layers; those of filters move by half with the load):
+The order of totals is the paper's: WSKP with three layers, with six, NBGD with two, MR-WSKP, MR-KP, KP, NBGD
+with seven, RAE. Where quotients to WSKP with six layers differ, and why, as measured on two cores:
 - WSKP's filter visits the 454 taps of six kernels in the paper, and KP's with 169 costs about the same. Here
   WSKP needs no taps but box sums, at most ten additions per channel and kernel, while KP takes an exponential
-  for each tap: seven to ten times as long, so KP takes 3.4 to 4.5 times WSKP's time (paper 2.16);
-- NBGD with two layers takes 2.1 to 2.2 times WSKP's time (paper 1.08), with a quarter of its multiply-adds:
-  a pixel is added to eight cells of each of three grids and reads as many, by index, which is three quarters
-  of the time. The second core halves WSKP's convolutions and takes a quarter off the grids: in one thread the
-  quotient is 1.6;
-- KP's network takes about three times WSKP's time, as its multiply-adds say; in the paper 2.2 times;
-- the U-Nets take more than theirs say, MR-WSKP over twice the prediction for 31 to 27 thousand a pixel (paper
-  1.9): a fifth of its time in one thread only pools and joins maps of 48 and 96 channels;
-- KP takes 2.1 to 2.3 times WSKP's memory (paper 3.16), since its logits exist for some rows at a time.
+  for each tap: ten times as long. So KP takes 3.1 times WSKP's time (paper 2.16). Its network takes 2.3 times
+  that of WSKP (paper 2.2), for three times the multiply-adds;
+- NBGD with two layers takes 1.5 times WSKP's time (paper 1.08), with a quarter of its multiply-adds: a pixel
+  is added to eight cells of each of three grids and reads as many, by index, which is 70 % of the time;
+- the U-Nets take more than their multiply-adds say, MR-KP 2.6 times WSKP's prediction for twice as many
+  (paper 2.0): a fifth of the time in one thread only pools and joins maps of 48 and 96 channels;
+- RAE takes 9.7 times WSKP's time, as its multiply-adds say; the paper measured ONND elsewhere (4.27);
+- KP takes 1.6 times WSKP's memory (paper 3.16), since its logits exist for some rows at a time.
 
     python -m tests.benchmarks realtime
 """

@@ -274,3 +274,12 @@ def test_halves_of_specular_light_follow_from_those_of_color_and_diffuse():
         )
     with pytest.raises(ValueError, match=r"missing buffer 'specular_a'.*diffuse_a"):
         derive(Frame({"color_a": given["color_a"]}, "s", 0), ["specular_a"])
+
+
+@pytest.mark.parametrize(
+    "name", ["second_albedo", "second_albedo_variance", "position_variance", "position_a"]
+)
+def test_what_follows_from_nothing_is_named_with_the_command_that_renders_it(name):
+    frame = Frame({"color": np.ones((2, 2, 3), np.float32)}, "room", 1)
+    with pytest.raises(ValueError, match=rf"missing buffer {name};.*trainer render stills --second-hit"):
+        derive(frame, [name])

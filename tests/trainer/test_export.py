@@ -70,7 +70,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("export")
     paths = {format: folder / f"net{SUFFIXES[format]}" for format in FORMATS}
     for format, path in paths.items():
-        source = Source("made.ckpt", "models.WSKP", {"layers": 2, "width": 6}, sha256="ab")
+        source = Source("made.ckpt", "models.WSKP", {"layers": 2, "width": 6}, sha256="ab", step=9)
         export(small_wskp(), path, format, source=source)  # type: ignore[arg-type]
     return paths
 
@@ -149,7 +149,7 @@ def test_metadata_holds_contract_source_and_parity(files: dict[str, Path], forma
     assert (said.model, said.format, said.inputs) == ("WSKP", format, net.inputs)
     assert said.frame_numbers == ("exposure", "depth_range")
     assert (artifact.halo, artifact.multiple, artifact.temporal) == (net.halo, 1, True)
-    assert said.source == Source("made.ckpt", "models.WSKP", {"layers": 2, "width": 6}, "ab")
+    assert said.source == Source("made.ckpt", "models.WSKP", {"layers": 2, "width": 6}, "ab", 9)
     assert said.parity is not None
     assert 0 <= said.parity.error <= said.parity.limit == LIMIT
     assert sum(h % 2 or w % 2 for _, h, w in said.parity.sizes) >= 3

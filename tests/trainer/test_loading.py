@@ -77,6 +77,11 @@ def test_a_training_checkpoint_gives_the_network_with_its_hyper_parameters_and_w
     assert len(loaded.source.sha256) == 64
 
 
+def test_a_training_checkpoint_tells_the_step_of_its_weights_where_it_says_one(tmp_path: Path) -> None:
+    assert resolve(str(checkpoint(tmp_path / "best.ckpt", net(), global_step=120))).source.step == 120
+    assert resolve(str(checkpoint(tmp_path / "old.ckpt", net(), global_step="?"))).source.step is None
+
+
 def test_averaged_weights_win_over_the_current_ones(tmp_path: Path) -> None:
     """Lightning's weight averaging keeps the average in `state_dict`."""
     current = {f"net.{name}": value for name, value in net(1).state_dict().items()}

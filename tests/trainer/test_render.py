@@ -16,6 +16,8 @@ from data.camera import motion
 from data.frames import FrameSet
 from data.manifest import FrameRecord, Manifest, SceneRecord
 from data.render.references import ENERGY_LIMIT
+from data.shards.index import Index
+from data.shards.read import ShardReader
 from trainer.cli import main
 from trainer.commands.render import _resumable, _summary
 from trainer.progress import SampleRate
@@ -80,6 +82,32 @@ def test_stills_of_a_file_become_a_data_set_whose_energy_agrees(scene, tmp_path,
     out = capsys.readouterr().out
     assert "standard errors" in out
     assert "next: trainer inspect" in out
+
+
+def test_additions_to_stills_are_written_read_and_prepared_and_change_nothing_else(
+    scene, tmp_path, monkeypatch, capsys
+):
+    plain, added = tmp_path / "plain", tmp_path / "added"
+    assert run(monkeypatch, command("stills", scene, plain, "--spp", 4, "--size", "32x32")) == 0
+    more = ("--spp", 4, "--size", "32x32", "--second-hit", "--histogram")
+    assert run(monkeypatch, command("stills", scene, added, *more)) == 0
+    before, after = (FrameSet(root).read("ball", 0).buffers for root in (plain, added))
+    assert all(np.array_equal(after[name], image) for name, image in before.items())
+    second = {f"second_albedo{part}" for part in ("", "_a", "_b", "_variance")}
+    position = {f"position{part}" for part in ("_a", "_b", "_variance")}
+    assert after.keys() - before.keys() == {"histogram", *second, *position}
+    # The ball reflects the floor; both are the scene's only reflectances.
+    assert 0 < after["second_albedo"].max() <= 0.74
+    capsys.readouterr()
+    assert run(monkeypatch, ["inspect", str(added)]) == 0
+    assert "second_albedo" in capsys.readouterr().out
+    names = {"second_albedo", "second_albedo_variance", "position", "position_variance"}
+    shards = tmp_path / "shards"
+    patches = ("--patch-size", "16", "--train-patches", "10000", "--processes", "1")
+    prepared = ["prepare", str(added), "--output", str(shards), "--buffers", ",".join(names), *patches]
+    assert run(monkeypatch, prepared) == 0
+    patch = ShardReader(Index.read(shards), "train").sample(0)
+    assert names <= patch.buffers.keys()
 
 
 def test_a_sequence_reprojects_onto_its_preceding_frame(scene, tmp_path, monkeypatch):
@@ -167,6 +195,13 @@ def test_histograms_are_for_stills(tmp_path, monkeypatch, capsys, kind):
     monkeypatch.chdir(tmp_path)
     assert run(monkeypatch, ["render", kind, "--random", "1", "--output", "set", "--histogram"]) == 2
     assert f"--histogram is for stills, not {kind}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["sequences", "samples"])
+def test_second_hits_are_for_stills(tmp_path, monkeypatch, capsys, kind):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, ["render", kind, "--random", "1", "--output", "set", "--second-hit"]) == 2
+    assert f"--second-hit is for stills, not {kind}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,8 @@ class Measured:
     Attributes:
         scored: Metrics of the frames, by name of the variant.
         costs: Name → what `trainer.benchmarking.cost` measured, of those that were measured.
-        parameters: Name → of the network in training and deployed; None where that is not known.
+        numbers: Name → parameters of the network in training and deployed, and the training step whose
+            weights were evaluated (the best in validation); None where that is not known.
         size: Width and height of the frames.
         device: Where time was measured.
         failed: Name → why there is nothing of it, or not all.
@@ -37,7 +38,7 @@ class Measured:
 
     scored: Scored
     costs: Mapping[str, Mapping[str, Any]]
-    parameters: Mapping[str, tuple[int | None, int | None]]
+    numbers: Mapping[str, tuple[int | None, int | None, int | None]]
     size: tuple[int, int]
     device: str
     failed: Mapping[str, str]
@@ -61,7 +62,7 @@ class Measured:
         return Measured(
             Scored(rows, [INPUT, *(m["label"] for m in methods)], metrics),
             costs,
-            {m["label"]: (m["parameters"], m["deployed"]) for m in methods},
+            {m["label"]: (m["parameters"], m["deployed"], m.get("step")) for m in methods},
             (int(frames["width"].median()), int(frames["height"].median())),
             " or ".join(dict.fromkeys(_place(cost) for cost in costs.values())),
             {**failed, **lost},
@@ -119,16 +120,16 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> None:
 
 
 def overview(ablation: Ablation, measured: Measured) -> Table:
-    """Return one row for each variant: metrics averaged over scenes, parameters, time of a frame."""
+    """Return one row for each variant: metrics averaged over scenes, parameters, step, time of a frame."""
     names = [variant.name for variant in ablation.variants]
-    rows, notes = _by_variant([INPUT, *names], measured), [NOTE, measured.timing()]
-    sizes = [measured.parameters.get(name, (None, None)) for name in (INPUT, *names)]
+    rows, notes = _by_variant([INPUT, *names], measured), [NOTE, STEP_NOTE, measured.timing()]
+    numbers = [measured.numbers.get(name, (None, None, None)) for name in (INPUT, *names)]
     table = tuple(
-        (name, (*cells[:-1], *(_number(size) for size in own), cells[-1]))
-        for (name, cells), own in zip(rows, sizes, strict=True)
+        (name, (*cells[:-1], *(_number(number) for number in own), cells[-1]))
+        for (name, cells), own in zip(rows, numbers, strict=True)
     )
     notes += [f"{name}: {reason}" for name, reason in measured.failed.items()]
-    heads = (*_heads(measured), "parameters", "deployed", "ms per frame ↓")
+    heads = (*_heads(measured), "parameters", "deployed", "step", "ms per frame ↓")
     return Table(OVERVIEW, ablation.title, "variant", heads, table, tuple(notes))
 
 
@@ -163,6 +164,8 @@ def pairs(ablation: Ablation, layout: Layout, measured: Measured) -> Table:
     heads = tuple(f"{head} {column}" for head in _heads(measured) for column in columns)
     return Table(layout.name, layout.title, "scene", heads, tuple(rows), (PAIRS_NOTE,))
 
+
+STEP_NOTE = "step: of the weights that were compared, the best of the training in validation."
 
 PAIRS_NOTE = (
     "Means over the frames of a scene, ± 95 % confidence over frames; of each pair the better one is bold."

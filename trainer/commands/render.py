@@ -26,7 +26,7 @@ files. Interrupted, the same command goes on; with a larger --reference-spp it r
 
   stills      for AFGSA, ACFM, KPCN, NFOR: diffuse and specular light, guides, two half buffers and the
               variance of the mean of every buffer, at several samples per pixel of the same stream;
-              with --histogram for RHF too
+              with --histogram for RHF too, with --second-hit for LBF
   sequences   for WSKP, BMFR, SVGF: 1 sample per pixel, positions, motion vectors, a moving camera
   samples     for layer embeddings, sample splatting: every sample apart, with 20 numbers
 """
@@ -93,6 +93,19 @@ def _image_arguments(group: Any) -> None:
         "--histogram",
         action="store_true",
         help="stills also have the histogram of each pixel's samples, which RHF reads: 60 more channels",
+    )
+    group.add_argument(
+        "--histogram-exposure",
+        metavar="X",
+        type=float,
+        help="factor on the radiance that histograms count (default: measured of each view, so that their "
+        "bins fit its brightness; 1 as the program of RHF's authors)",
+    )
+    group.add_argument(
+        "--second-hit",
+        action="store_true",
+        help="stills also have the albedo of what paths hit second, and halves and variance of positions, "
+        "which LBF reads: 21 more channels",
     )
     group.add_argument("--reference-spp", type=int, help="samples per pixel of the reference")
     group.add_argument("--max-depth", type=int, help="longest path in segments (default 8)")
@@ -217,6 +230,8 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         max_depth=args.max_depth,
         chunk=chunk,
         histogram=args.histogram,
+        histogram_exposure=args.histogram_exposure,
+        second_hit=args.second_hit,
     )
 
 

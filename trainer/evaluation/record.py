@@ -98,6 +98,7 @@ def write_record(
                 "sha256": o.facts.get("sha256"),
                 "parameters": o.facts.get("parameters"),
                 "deployed": o.facts.get("deployed"),
+                "step": o.facts.get("step"),
                 "status": o.status,
                 "reason": o.told(),
                 "cost": costs.get(o.method.label),

@@ -240,6 +240,7 @@ def facts_of(loaded: Loaded) -> dict[str, Any]:
         "inputs": list(model.inputs),
         "options": source.init_args,
         "sha256": source.sha256,
+        "step": source.step,
     }
 
 

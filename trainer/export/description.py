@@ -40,12 +40,14 @@ class Source:
         class_path: Import path of the denoiser's class.
         init_args: Its hyper-parameters, as plain values.
         sha256: Checksum of the file, empty where there is none.
+        step: Training step of the weights, None where that is not known.
     """
 
     reference: str
     class_path: str = ""
     init_args: dict[str, Any] = field(default_factory=dict)
     sha256: str = ""
+    step: int | None = None
 
 
 @dataclass(frozen=True)

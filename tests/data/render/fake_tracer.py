@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.buffers import SAMPLE_BUFFERS
+from data.buffers import BUFFERS, SAMPLE_BUFFERS
 from data.camera import Camera
 from data.render.spec import SceneSpec, View
 
@@ -43,7 +43,8 @@ class FakeTracer:
                 yield Part(slice(top, top + band), values)
 
     def _values(self, name, rng, shape):
-        channels = len(SAMPLE_BUFFERS[name].letters)
+        entry = SAMPLE_BUFFERS.get(name) or BUFFERS[name]
+        channels = len(entry.letters)
         columns = np.arange(self.width, dtype=np.float32)
         left = np.broadcast_to(columns < self.width // 2, shape)[..., None]
         if name == "radiance":
@@ -53,7 +54,7 @@ class FakeTracer:
             return np.where(left, 2 + rng.uniform(-1, 1, (*shape, 1)), 0).astype(np.float32)
         if name == "hit":
             return left.astype(np.float32)
-        low = 0.0 if SAMPLE_BUFFERS[name].low is None else SAMPLE_BUFFERS[name].low
+        low = 0.0 if entry.low is None else entry.low
         return rng.uniform(low, 1, (*shape, channels)).astype(np.float32)
 
     def pixel_camera(self, frame):

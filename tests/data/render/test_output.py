@@ -85,6 +85,22 @@ def test_another_recipe_is_refused_in_the_words_of_the_command_line(tmp_path):
     assert files(tmp_path) == {".render/job.json"}
 
 
+def test_an_addition_is_another_recipe_and_named_by_its_option(tmp_path):
+    rendered(tmp_path, Named("a"))
+    other = with_options(RECIPE, second_hit=True)
+    with pytest.raises(ValueError, match=r"another recipe \(--second-hit False instead of True\)"):
+        examine(tmp_path, other, _works([Named("a")], other, tmp_path), False)
+
+
+def test_views_of_a_recipe_with_additions_have_the_seeds_of_those_without(tmp_path):
+    plain, asked = (
+        _works([Named("a")], r, tmp_path)["a"][0] for r in (RECIPE, with_options(RECIPE, histogram=True))
+    )
+    assert plain.key != asked.key
+    assert plain.seed("input") == asked.seed("input")
+    assert plain.seed("reference", 64) == asked.seed("reference", 64)
+
+
 def test_a_command_that_failed_before_any_frame_was_made_does_not_bind_the_next(tmp_path):
     works = _works([Named("a")], RECIPE, tmp_path)
     prepare(tmp_path, RECIPE, examine(tmp_path, RECIPE, works, False))

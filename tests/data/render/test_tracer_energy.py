@@ -114,7 +114,8 @@ def test_the_scalar_variant_gives_the_same_guides_and_radiance():
     )
     assert child.returncode == 0, child.stderr[-2000:]
     there = dict(line.split("=") for line in child.stdout.split())
-    here = scenes.trace(scenes.box(8, 8), "radiance", "diffuse", "depth", "hit", spp=scenes.few(1024))
+    names = ("radiance", "diffuse", "depth", "hit", "second_albedo")
+    here = scenes.trace(scenes.box(8, 8), *names, spp=scenes.few(1024))
     for name, values in here.items():
         mean, error = (float(x) for x in there[name].split("/"))
         own = values.astype(np.float64).mean((1, 2, 3))

@@ -9,7 +9,7 @@ from data.exr import read_frame
 from data.histograms import sample_histogram
 from data.manifest import FrameRecord
 from data.render.frames import noisy_frames
-from data.render.recipe import Recipe, defaults, seed_of, view_key, with_options
+from data.render.recipe import Recipe, defaults, seed_of, stream_key, view_key, with_options
 from data.render.references import Reference, energy_z
 from data.render.views import ViewWork, add_pass, render_view
 from tests.data.render.fake_tracer import FakeTracer, spec
@@ -284,3 +284,95 @@ def test_without_histograms_a_recipe_is_what_it_was_and_with_them_another():
     assert not STILLS.same_work(asked.to_json())
     with pytest.raises(ValueError, match="--histogram is for stills, not samples: their histograms follow"):
         with_options(defaults("samples"), histogram=True)
+
+
+SECOND_HITS = with_options(STILLS, second_hit=True)
+
+
+def test_with_second_hits_a_still_has_their_albedo_and_positions_have_halves(tmp_path):
+    tracer = FakeTracer(chunk=2**14)
+    (chunk,) = FakeTracer(chunk=2**14).trace(0, 4, seed_of("k", "input"), SECOND_HITS.names)
+    done = work(tmp_path, SECOND_HITS)
+    render(done, tracer)
+    buffers = read_frame(tmp_path / records(done)[1].file).buffers
+    for name in ("position", "second_albedo"):
+        samples = chunk.values[name].astype(np.float64)
+        assert np.allclose(buffers[f"{name}_a"], samples[::2].mean(0), rtol=1e-3)
+        assert np.allclose(buffers[f"{name}_b"], samples[1::2].mean(0), rtol=1e-3)
+        assert np.allclose(buffers[f"{name}_variance"], samples.var(0, ddof=1) / 4, rtol=1e-5)
+    assert np.allclose(buffers["second_albedo"], chunk.values["second_albedo"].mean(0), rtol=1e-3)
+
+
+def test_additions_leave_all_other_buffers_as_they_are(tmp_path):
+    kept = {}
+    for name, options in {"without": {}, "with": {"second_hit": True, "histogram": True}}.items():
+        done = work(tmp_path / name, with_options(STILLS, **options))
+        render(done, FakeTracer(chunk=2**14))
+        kept[name] = read_frame(tmp_path / name / records(done)[1].file).buffers
+    added = kept["with"].keys() - kept["without"].keys()
+    parts = ("_a", "_b", "_variance")
+    assert added == {
+        "histogram",
+        "second_albedo",
+        *(f"{name}{part}" for name in ("second_albedo", "position") for part in parts),
+    }
+    assert all(np.array_equal(kept["with"][name], image) for name, image in kept["without"].items())
+
+
+def test_seeds_of_a_view_do_not_depend_on_additions_and_its_key_does():
+    asked = [
+        STILLS,
+        SECOND_HITS,
+        with_options(STILLS, histogram=True),
+        with_options(SECOND_HITS, histogram=True),
+    ]
+    assert {stream_key({"seed": 1}, 0, recipe) for recipe in asked} == {view_key({"seed": 1}, 0, STILLS)}
+    assert len({view_key({"seed": 1}, 0, recipe) for recipe in asked}) == 4
+    other = stream_key({"seed": 1}, 0, with_options(SECOND_HITS, spp=(8,)))
+    assert other != stream_key({"seed": 1}, 0, SECOND_HITS)
+
+
+def test_without_additions_a_recipe_is_what_it_was_before_there_were_any():
+    before = {"kind", "width", "height", "spp", "reference_spp", "max_depth", "chunk", "version"}
+    assert STILLS.to_json().keys() == before
+    assert SECOND_HITS.to_json().keys() == before | {"second_hit"}
+    assert SECOND_HITS.same_work(with_options(SECOND_HITS, reference_spp=128).to_json())
+    for other in (STILLS, with_options(STILLS, histogram=True), with_options(SECOND_HITS, histogram=True)):
+        assert not SECOND_HITS.same_work(other.to_json())
+        assert not other.same_work(SECOND_HITS.to_json())
+    with pytest.raises(ValueError, match="--second-hit is for stills, not sequences; leave it out"):
+        with_options(defaults("sequences"), second_hit=True)
+
+
+def test_the_seeds_of_a_view_follow_from_its_stream():
+    plain = ViewWork(None, "fake", 0, "k", STILLS)
+    assert plain.seed("input") == seed_of("k", "input")
+    assert replace(plain, stream="s").seed("reference", 64) == seed_of("s", "reference", 64)
+
+
+def test_histograms_of_radiance_as_it_was_rendered_can_be_asked_for(tmp_path):
+    asked = with_options(STILLS, histogram=True, histogram_exposure=1.0)
+    tracer = FakeTracer(chunk=2**14, scale=50.0)
+    (chunk,) = FakeTracer(chunk=2**14, scale=50.0).trace(0, 4, seed_of("k", "input"), asked.names)
+    done = work(tmp_path, asked)
+    render(done, tracer)
+    assert [spp for _, spp, _ in tracer.calls] == [4, 64], "no sample is needed to measure an exposure"
+    last = records(done)[-1]
+    found = read_frame(tmp_path / last.file).buffers["histogram"]
+    assert np.allclose(found, sample_histogram(chunk.values["radiance"]), atol=1e-5)
+    assert last.checks["histogram_exposure"] == 1
+    assert not asked.same_work(with_options(STILLS, histogram=True).to_json())
+    assert not with_options(STILLS, histogram=True).same_work(asked.to_json())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"histogram_exposure": 1.0}, "--histogram-exposure is for --histogram"),
+        ({"histogram": True, "histogram_exposure": 0.0}, "--histogram-exposure 0.0: expected a positive"),
+        ({"histogram": True, "histogram_exposure": float("nan")}, "expected a positive number"),
+    ],
+)
+def test_exposures_of_histograms_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        with_options(STILLS, **options)

@@ -45,6 +45,7 @@ def measured() -> Measured:
             ]  # fmt: skip
     methods: list[dict[str, Any]] = [
         {"label": name, "status": "done", "reason": None, "parameters": 1000 + len(name), "deployed": 500,
+         "step": 30,
          "cost": None if name not in SECONDS else {
              "seconds_per_megapixel": SECONDS[name], "spread": [SECONDS[name] - 0.1, SECONDS[name] + 0.1],
              "device": "cpu", "threads": 2, "calls": 7, "others": 0.31 if name == "one" else 0.05}}
@@ -61,18 +62,18 @@ def texts(table: Table) -> dict[str, list[str]]:
 
 def test_the_overview_has_every_variant_with_metrics_parameters_and_time_of_a_frame() -> None:
     table = overview(ABLATION, measured())
-    assert table.columns == ("psnr_wskp ↑", "ssim_wskp ↑", "parameters", "deployed", "ms per frame ↓")
+    assert table.columns == ("psnr_wskp ↑", "ssim_wskp ↑", "parameters", "deployed", "step", "ms per frame ↓")
     assert texts(table) == {
-        "input": ["12.00", "0.2500", "-", "-", "-"],
-        "six": ["32.00", "0.7500", "1,003", "500", "40.0"],  # 2 s per megapixel, 0.02 megapixels
-        "six plain": ["31.00", "0.7250", "1,009", "500", "-"],
-        "one": ["27.00", "0.6250", "1,003", "500", "20.0"],
-        "lost": ["-", "-", "-", "-", "-"],
+        "input": ["12.00", "0.2500", "-", "-", "-", "-"],
+        "six": ["32.00", "0.7500", "1,003", "500", "30", "40.0"],  # 2 s per megapixel, 0.02 megapixels
+        "six plain": ["31.00", "0.7250", "1,009", "500", "30", "-"],
+        "one": ["27.00", "0.6250", "1,003", "500", "30", "20.0"],
+        "lost": ["-", "-", "-", "-", "-", "-"],
     }
     ranks = {head: [cell.rank for cell in cells] for head, cells in table.rows}
-    assert ranks["six"] == [1, 1, 0, 0, 2]
-    assert ranks["one"] == [3, 3, 0, 0, 1]
-    assert ranks["input"] == [0] * 5
+    assert ranks["six"] == [1, 1, 0, 0, 0, 2]
+    assert ranks["one"] == [3, 3, 0, 0, 0, 1]
+    assert ranks["input"] == [0] * 6
     assert "lost: failed: no memory" in table.notes
     (timing,) = (note for note in table.notes if note.startswith("Time of a frame of 200x100 pixels"))
     assert "cpu, 2 threads" in timing
