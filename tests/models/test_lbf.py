@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from data.buffers import buffer
 from models.denoiser import Buffers, select
 from models.lbf import LBF
 from models.ops.secondary_features import NUMBERS
@@ -132,16 +132,14 @@ def test_float32_gives_the_result_of_float64() -> None:
 
 
 def test_the_papers_groups_make_36_features_and_436_parameters() -> None:
-    five = ("normal", "diffuse_albedo", "specular_albedo", "depth", "visibility")
-    method = LBF(five)
-    assert NUMBERS * len(five) + 1 == 36
+    method = LBF()
+    assert method.features == ("position", "normal", "albedo", "second_albedo", "visibility")
+    assert NUMBERS * len(method.features) + 1 == 36
     assert method.first.weight.shape[:2] == (10, 36)
     assert method.last.weight.shape[:2] == (6, 10)
     assert sum(parameter.numel() for parameter in method.parameters()) == 436
+    assert method.rule.groups == (3, 3, 3, 3, 1)
     assert method.rule.window == 27
-    assert inspect.signature(LBF).parameters["features"].default == (
-        *("position", "normal", "albedo", "second_albedo", "visibility"),
-    )
 
 
 def test_distances_are_those_of_the_frame_whatever_its_unit() -> None:
@@ -235,6 +233,14 @@ def test_what_is_missing_and_what_makes_it_is_named() -> None:
     del given["albedo_variance"]
     with pytest.raises(ValueError, match=r"missing: albedo_variance.*`trainer render stills` writes"):
         LBF(("albedo",))(given)
+
+
+def test_second_hits_that_are_missing_and_what_makes_them_are_named() -> None:
+    given = {name: torch.rand(1, buffer(name).channels, 16, 16) for name in LBF().inputs}
+    for missing in ("second_albedo_a", "position_variance"):
+        lacking = {name: image for name, image in given.items() if name != missing}
+        with pytest.raises(ValueError, match=f"missing: {missing}.*trainer render stills --second-hit"):
+            LBF()(lacking)
 
 
 def test_halves_or_a_mean_and_a_variance_do_where_the_others_are_missing() -> None:
