@@ -15,7 +15,7 @@ the paper prints 1 / (2 * 7^2), which is `color_factor=0.0102`. Its weights are 
 What is decided here, since it is not known:
 
 - Distances (position, depth) are relative to the largest of the frame, so that the least variance 1e-4 means
-  the same in every scene.
+  the same in every scene; positions of training patches to the largest of the patch.
 - The 36 numbers are normalised by mean and standard deviation of the first batch of a training, over all of
   its processes, measured before the first step and stored with the weights; what does not vary in it, as
   1 / samples per pixel, is only shifted. Without training they stay as they are.
@@ -23,9 +23,9 @@ What is decided here, since it is not known:
 - `exposure` multiplies the colour first, since the small constant of its distance has the units of a
   variance.
 
-Reached on the still of the sample that is held out, after 80 steps on the other five (`lbf_sample.yaml`): PSNR
-27.27 dB and half the relative squared error 0.0132, as AFGSA prints them; the noisy still has 22.50 dB and
-0.0595. The paper's figures are averages over scenes that are not public.
+Reached on the still of the sample that is held out, after 80 steps on the other five (`lbf_sample.yaml`):
+PSNR 27.27 dB and half the relative squared error 0.0132, as AFGSA prints them; the noisy still has 22.50 dB
+and 0.0595. The paper's figures are averages over scenes that are not public.
 
 Radiance, features and variances that are not finite count as 0, and what is beyond 1e9 (variances 1e18) as
 that. 436 parameters.

@@ -190,6 +190,18 @@ def test_format_that_cannot_be_exported_leaves_the_others(first_rank, monkeypatc
     assert f"trainer export --model {checkpoint} --format onnx" in said
 
 
+def test_best_weights_of_a_method_that_is_never_exported_stay_a_checkpoint(first_rank, monkeypatch, capsys):
+    checkpoint = first_rank.folder / "checkpoints" / "best.ckpt"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(b"x")
+    exported = []
+    monkeypatch.setattr(ExportBest, "_export", lambda *arguments: exported.append(arguments))
+    module = SimpleNamespace(net=SimpleNamespace(no_export="it is a loop"))
+    ExportBest().on_fit_end(SimpleNamespace(logger=first_rank, is_global_zero=True), module)
+    assert exported == []
+    assert capsys.readouterr().err == f"{checkpoint} is not exported: it is a loop\n"
+
+
 def test_durations_read_as_people_say_them():
     assert [duration(s) for s in (7.4, 65, 3723)] == ["7 s", "1:05", "1:02:03"]
 

@@ -172,7 +172,10 @@ def filter_scaled(
         return np.pad(np.concatenate(images), ((0, 0), (0, 0), (rule.window, far)))
 
     # Spreads lie where features do.
-    joined, inverse = padded(color, variance, features, inside), padded(color, variance, 1 / spread)
+    joined, inverse = (
+        padded(color, variance, features, inside),
+        padded(color, variance, np.reciprocal(spread)),
+    )
     starts = 6 + np.cumsum([0, *rule.groups])
     numbers, size = np.array([rule.factor, rule.epsilon], np.float32), (width, rule.window)
     kinds = 4 + 4 * rule.distances * slopes
