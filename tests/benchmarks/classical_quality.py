@@ -22,6 +22,26 @@ growth of what is resident in a call.
 
 What is done is kept in `bench/classical/quality`, still by still: a run that was cut off goes on there, and
 one with another method computes that alone.
+
+What is seen in the pictures, and why:
+- NLM, joint NLM, faintly RDFC: grainy squares of 21x21 pixels around a firefly. It has so large a variance
+  that it counts as like everything; each pixel of its window takes some of it.
+- Multi-scale NLM, RHF: dark and bright rings around fireflies and lamps. The coarser scale has spread their
+  light; what is taken off again at the finer one lies elsewhere. Nothing keeps the sum above 0.
+- RHF: blurred at 4 samples per pixel, with lamps spread over their windows: hardly any bin has more than one
+  sample of two pixels to tell them apart by.
+- RDFC: a bright band some 5 to 10 pixels from a lamp (Cornell box). Features alone take the lamp for ceiling.
+  The estimated error of that candidate is a hundred times the others' there, but the choice is smoothed over
+  11x11 pixels, and a tenth of a lamp of 70 times white is left.
+- WLR, WLR-PF: dark and bright grain at 4 samples per pixel, some left at 32. Shared bandwidths are estimated
+  pixel by pixel from noisy trials, and small ones come by chance: on the wall of indoor-000002 (4 samples)
+  they are 0.41 in the worst 5 % of the pixels, 0.58 elsewhere. `least_bandwidth=0.5` gains 1 dB there.
+- NFOR: black and white rings around fireflies, black spots beside the caustic, black and white glass: a line
+  fitted to them goes below 0 where they are not (`models.ops.fireflies` limits them).
+- Cross bilateral: lamps and textures blurred into their surroundings; joint bilateral: lamps, and what is
+  reflected. The one looks at smoothed colours alone, the other at features alone. Joint bilateral: bright
+  dots along the sky, where pixels see two surfaces and their light was divided by the mean of both albedos.
+Dots on the wall of indoor-000002 are its texture: the albedo has them.
 """
 
 from __future__ import annotations
