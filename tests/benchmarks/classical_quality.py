@@ -37,7 +37,9 @@ What is seen in the pictures, and why:
   pixel by pixel from noisy trials, and small ones come by chance: on the wall of indoor-000002 (4 samples)
   they are 0.41 in the worst 5 % of the pixels, 0.58 elsewhere. `least_bandwidth=0.5` gains 1 dB there.
 - NFOR: black and white rings around fireflies, black spots beside the caustic, black and white glass: a line
-  fitted to them goes below 0 where they are not (`models.ops.fireflies` limits them).
+  fitted to them goes below 0 where they are not (`models.ops.fireflies` limits them). Haloes in clean ground
+  beside noisy objects (the window of indoor-000004): a noisy pixel finds clean ones within its noise, and its
+  fit is averaged in there. With a thousandth of the variance the error there is 1.3 % instead of 12.7 %.
 - Cross bilateral: lamps and textures blurred into their surroundings; joint bilateral: lamps, and what is
   reflected. The one looks at smoothed colours alone, the other at features alone. Joint bilateral: bright
   dots along the sky, where pixels see two surfaces and their light was divided by the mean of both albedos.
