@@ -25,7 +25,8 @@ MODULES = (
     *("rendering", "procedural"),
     *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "kp", "nbgd", "realtime", "stills_quality"),
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
-    *("nfor", "nfor_growth", "nlm", "rdfc", "rhf", "lbf", "classical_quality", "flicker"),
+    *("nfor", "nfor_growth", "nlm", "rdfc", "rhf", "lbf"),
+    *("classical_quality", "sequence_quality", "flicker"),
     *("scaling", "remote", "outage", "serve"),
     "evaluation",
 )
