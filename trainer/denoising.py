@@ -236,7 +236,7 @@ class ClipDenoiser:
             frame = derive(frame, self._wanted(frame, model), depth_kind=self.clip.depth, previous=previous)
         except ValueError as error:
             hint = advice(model, self._fitting.has(frame, self.clip.depth, previous))
-            if not hint:
+            if not hint or hint in str(error):
                 raise
             raise ValueError(f"{error}; {hint}") from error
         exposure = self._choose_exposure(frame, follows)
