@@ -287,12 +287,7 @@ class ClipDenoiser:
         return frame
 
     def _follows(self, frame: Frame) -> bool:
-        last = self._last
-        return (
-            self.clip.sequence
-            and last is not None
-            and (last.scene, last.index + 1) == (frame.scene, frame.index)
-        )
+        return self.clip.sequence and frame.follows(self._last)
 
     def _wanted(self, frame: Frame, model: Model) -> list[str]:
         names = [name for name in model.inputs if name != SAMPLES]
