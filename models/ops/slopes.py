@@ -34,8 +34,8 @@ def _along(image: Tensor, axis: int) -> Tensor:
     if count == 0:
         return torch.zeros_like(image)
     difference = image.diff(dim=axis)
-    # At the border there is one neighbour only: the next difference stands for the one that is missing, or the
-    # cliff between a last pixel and its neighbour would be a slope.
+    # At the border there is one neighbour only: the next difference stands for the one that is missing, or
+    # the cliff between a last pixel and its neighbour would be a slope.
     behind = torch.cat([difference, difference.narrow(axis, max(count - 2, 0), 1)], axis)
     before = torch.cat([difference.narrow(axis, min(count - 1, 1), 1), difference], axis)
     return torch.where(behind.abs() < before.abs(), behind, before)
