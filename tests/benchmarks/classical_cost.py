@@ -41,7 +41,7 @@ SIZES = {"0.25": (432, 576), "1": (864, 1152)}
 """Megapixels → rows and columns."""
 
 FEATURES = ("normal", "albedo", "depth")
-SMALL, CALLS, LONG, LIMIT_S = 64, 3, 5.0, 300
+SMALL, CALLS, LONG, LIMIT_S = 64, 3, 3.0, 300
 REST = "everything else"
 
 
@@ -72,7 +72,10 @@ class Method:
     steps: Mapping[str, Named] = field(default_factory=dict)
 
 
-_PREFILTER: Mapping[str, Named] = {"models.ops.features.nlm_filter": "features"}
+_PREFILTER: Mapping[str, Named] = {
+    "models.ops.features.Prefilter.__call__": "features",
+    "models.ops.features.Prefilter.halves": "features",
+}
 _NFOR: Mapping[str, Named] = {
     **_PREFILTER,
     "models.classical.nfor.collaborative_regression": "regressions",
