@@ -27,6 +27,7 @@ MODULES = (
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
     *("nfor", "nfor_growth", "nlm", "rdfc", "rhf", "lbf"),
     *("classical_quality", "sequence_quality", "flicker"),
+    *("classical_cost", "classical_plain", "frame_limit"),
     *("scaling", "remote", "outage", "serve"),
     "evaluation",
 )
