@@ -18,7 +18,8 @@ passes use a window of radius 5, is not. Five points differ from it or are not k
 - The ridge leaves the constant out, so that a constant image stays constant.
 - Windows are cut off at the border of the image.
 - The variance of filtered features, which the comparison does not name, is a quarter of the squared
-  difference of the filtered halves.
+  difference of the filtered halves. Where there are no halves it is that of the features before: with 0 every
+  direction stands out of the noise (classroom, 4 samples per pixel: 17.5 dB with 0, 19.0 with this).
 
 Colours are compared, and curvatures measured, on radiance times `exposure`, since their constants have units.
 
@@ -244,6 +245,8 @@ class WLR(Denoiser):
         else:
             filtered = self._prefilter(Halves(*(x[:, None] for x in parts)), noise)
             a, b, image = (x[:, 0] for x in filtered)
-            variance = 0.25 * (b - a).square()
+            # One buffer for both halves does not tell how noisy its filtered form is: at most as before.
+            known = halves.independent(noise)
+            variance = 0.25 * (b - a).square() if known else 2 * parts.variance
         limit = self.variance_limit
         return Noisy(image, torch.nan_to_num(variance, limit, limit, limit).clamp(0.0, limit))

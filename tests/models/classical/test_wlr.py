@@ -216,6 +216,15 @@ def test_prefiltered_features_without_noise_are_the_features() -> None:
     assert torch.equal(WLR(window=3, prefilter=True, feature_noise="none")(given).color, plain)
 
 
+def test_prefiltered_features_without_halves_are_taken_as_noisy_as_before(buffers: dict[str, Tensor]) -> None:
+    network = WLR(window=3, prefilter=True, feature_noise="variance", patch=1, prefilter_window=1)
+    for name in network.features:
+        given = 3e-4 + 0.5 * buffers[f"{name}_variance"].clamp(0, 1)
+        found = network._feature({**buffers, f"{name}_variance": given}, name)
+        assert torch.allclose(found.variance, given)
+        assert not torch.equal(found.image, buffers[name])
+
+
 def test_prefiltered_features_are_those_of_nfor(buffers: dict[str, Tensor]) -> None:
     given = single(buffers)
     options: dict[str, Any] = {"patch": 1, "prefilter_window": 2, "final_window": 1, "fused": False}
