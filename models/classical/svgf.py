@@ -258,7 +258,7 @@ class SVGF(SequenceFilter):
     def _with_variance(self, now: _Past, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
         """Return the colour and the variance of its luminance (B, 1, H, W); young pixels ask around."""
         variance = _variance(now.moments)
-        young = now.frames < self.young
+        young = now.frames < self.young - 1e-3  # a mean's rounding makes no pixel young
         if not exporting() and not bool(young.any()):
             return now.color, variance
         joined, taps = torch.cat([now.color, now.moments], 1), box_taps(_YOUNG_RADIUS)

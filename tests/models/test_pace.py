@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models import NFOR, NLM
+from models import NFOR, NLM, WLR
 from models.denoiser import Denoiser
 from models.pace import Pace, listening, tick
 from tests.models.frames import split_buffers
@@ -22,6 +22,10 @@ def test_steps_add_up_to_the_same_number_for_every_image() -> None:
         for method in (NLM(2, 1, fused=fused), NFOR(window=2, patch=1, prefilter_window=1, fused=fused)):
             assert steps(method, 16, 16) > 0
             assert steps(method, 40, 23) == pytest.approx(steps(method, 16, 16))
+    for memory in (None, 100_000):
+        local = WLR((), window=2, color_noise="measured", memory=memory, fused=True)
+        assert steps(local, 16, 16) > 0
+        assert steps(local, 40, 23) == pytest.approx(steps(local, 16, 16))
 
 
 def test_a_pace_rises_from_nothing_to_all() -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from models.classical.svgf import SVGF
+from models.classical.svgf import SVGF, _Past
+from models.ops.atrous import Surfaces
 from tests.models.frames import largest_relative
 from tests.models.plain_svgf import Options, svgf
 from tests.models.sequences import at_rest, image, run, sequence, tensors, walk
@@ -93,6 +94,16 @@ def test_the_number_of_frames_stops_at_32() -> None:
     states = [result.state for result in run(network, frames)]
     assert (states[31]["count"] == 32).all()
     assert (states[39]["count"] == 32).all()
+
+
+def test_the_rounding_of_a_number_of_frames_makes_no_pixel_young() -> None:
+    (frame,) = sequence(1)
+    network = SVGF()
+    surfaces = Surfaces(frame["normal"], frame["depth"], 8, network.stops)
+    light, moments = frame["irradiance"], torch.ones_like(frame["motion"])
+    for frames, kept in ((4.0 - 2e-7, True), (3.9, False)):
+        now = _Past(light, moments, torch.full_like(frame["depth"], frames))
+        assert torch.equal(network._with_variance(now, surfaces)[0], light) == kept
 
 
 def test_the_variance_of_old_pixels_is_that_of_their_own_luminance_over_time() -> None:
