@@ -1,10 +1,10 @@
 """The hot loops of non-local means and NFOR, fused into compiled kernels for the CPU (Numba).
 
-The same formulas as `models.ops.nlm`, `models.ops.regression` and `models.ops.histogram_distance`, which are
-the reference and run where Numba is not installed (optional extra `fast`) or cannot work. Here a tile of
-pixels stays in the cache through all steps: distances, box sums, exponential, sums of products,
-factorisation, prediction. Strips of rows run on as many threads as PyTorch may use; each adds into images of
-its own, which are joined in order.
+The same formulas as `models.ops.nlm`, `models.ops.regression`, `models.ops.histogram_distance` and
+`models.ops.scaled_bilateral`, which are the reference and run where Numba is not installed (optional extra
+`fast`) or cannot work. Here a tile of pixels stays in the cache through all steps: distances, box sums,
+exponential, sums of products, factorisation, prediction. Strips of rows run on as many threads as PyTorch may
+use; each adds into images of its own, which are joined in order.
 
 Weights below 3e-20 are taken as 0; `weights.py` says why.
 
