@@ -118,6 +118,19 @@ class Frame:
         """`scene/frame index`, for messages."""
         return f"{self.scene}/frame {self.index}"
 
+    def follows(self, last: Frame | None) -> bool:
+        """Return whether it is the frame after `last` of the same scene.
+
+        Frames with `notes["view"]` show one view with several numbers of samples: the next view with the same
+        number comes after one.
+        """
+        if last is None or last.scene != self.scene:
+            return False
+        now, before = self.notes.get("view"), last.notes.get("view")
+        if now is None or before is None:
+            return last.index + 1 == self.index
+        return bool(before + 1 == now) and last.spp == self.spp
+
     def validate(self) -> None:
         """Check names, types and sizes.
 

@@ -136,17 +136,22 @@ class FrameSet:
     def _labelled(self, frame: Frame, scene: str, record: FrameRecord) -> Frame:
         frame = replace(frame, scene=scene, index=record.index, exposure=record.exposure, spp=record.spp)
         frame.notes["sequence"] = self.manifest.scenes[scene].sequence
+        if record.view is not None:
+            frame.notes["view"] = record.view
         return frame
 
     def sequence(self, scene: str, names: Iterable[str] | None = None) -> Iterator[Frame]:
-        """Read the frames of a scene one after the other; `motion` is derived from the preceding camera."""
+        """Read the frames of a scene one after the other; `motion` is derived from the preceding camera.
+
+        Frames of one view with several numbers of samples: all with the same number, then the next.
+        """
         wanted = None if names is None else list(names)
         previous: Frame | None = None
-        for record in self.frames(scene):
+        for record in (r for strand in self.manifest.scenes[scene].strands() for r in strand):
             rest = None if wanted is None else [n for n in wanted if n != "motion"]
             frame = self.read(scene, record.index, rest)
             if wanted is not None and "motion" in wanted:
-                before = previous if previous is not None and previous.index == record.index - 1 else frame
+                before = previous if previous is not None and frame.follows(previous) else frame
                 frame = derive(frame, ["motion"], previous=before.camera)
             previous = frame
             yield frame

@@ -59,6 +59,11 @@ class FrameRecord:
     checks: dict[str, float] = field(default_factory=dict)
     remarks: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def moment(self) -> int:
+        """When it is; frames of one view with different samples per pixel are of the same moment."""
+        return self.index if self.view is None else self.view
+
 
 @dataclass(frozen=True)
 class SceneRecord:
@@ -81,6 +86,18 @@ class SceneRecord:
     license: str = ""
     provenance: str = ""
     origin: dict[str, Any] = field(default_factory=dict)
+
+    def strands(self) -> list[tuple[FrameRecord, ...]]:
+        """Return the frames in the order in which they may follow one another.
+
+        A camera path whose views have several numbers of samples per pixel is one sequence for each number;
+        otherwise there is one list of all.
+        """
+        views = [frame.view for frame in self.frames]
+        if not self.sequence or None in views or len(set(views)) == len(views):
+            return [self.frames]
+        levels = dict.fromkeys(frame.spp for frame in self.frames)
+        return [tuple(frame for frame in self.frames if frame.spp == level) for level in levels]
 
 
 @dataclass(frozen=True)

@@ -192,9 +192,14 @@ class Shards(LightningDataModule):
         return tuple(self.index.scenes(split))
 
     def independent_views(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of a split whose frames do not follow one another, in order."""
+        """Return the scenes of a split whose frames do not follow one another as they come, in order."""
         found = self.index.manifest["scenes"]
-        return tuple(scene for scene in self.scenes(split) if not found[scene]["sequence"])
+
+        def independent(scene: str) -> bool:
+            views = [frame["view"] for frame in found[scene]["frames"] if "view" in frame]
+            return not found[scene]["sequence"] or len(set(views)) < len(views)
+
+        return tuple(scene for scene in self.scenes(split) if independent(scene))
 
     def counts(self) -> dict[str, int]:
         """Return the number of samples of each split."""

@@ -133,8 +133,7 @@ class Accumulator:
         last = self._previous
         return (
             last is not None
-            and last.scene == frame.scene
-            and last.index + 1 == frame.index
+            and frame.follows(last)
             and (last.height, last.width) == (frame.height, frame.width)
             and frame.notes.get("sequence") is not False
         )

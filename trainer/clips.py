@@ -119,16 +119,17 @@ def _data_set(root: Path, split: str | None) -> list[Clip]:
     clips = []
     for scene in scenes:
         record = frames.manifest.scenes[scene]
-        items = tuple(
-            Item(
-                partial(frames.read, scene, frame.index),
-                str(root / frame.file),
-                f"{scene}/f{frame.index:03d}",
-                root / frame.file,
+        for strand in record.strands():
+            items = tuple(
+                Item(
+                    partial(frames.read, scene, frame.index),
+                    str(root / frame.file),
+                    f"{scene}/f{frame.index:03d}",
+                    root / frame.file,
+                )
+                for frame in strand
             )
-            for frame in record.frames
-        )
-        clips.append(Clip(items, record.sequence, frames.manifest.depth, dict(record.thresholds)))
+            clips.append(Clip(items, record.sequence, frames.manifest.depth, dict(record.thresholds)))
     return clips
 
 
@@ -145,19 +146,24 @@ def _layout(root: Path, kind: str) -> list[Clip]:
 
 def _files(found: list[Path], folder: Path, several: bool) -> Clip:
     prefix = f"{folder.resolve().name}/" if several else ""
-    depth, thresholds = _known_about(folder)
+    sequence, depth, thresholds = _known_about(folder)
     items = tuple(Item(partial(read_frame, p), str(p), f"{prefix}{p.stem}", p) for p in found)
-    return Clip(items, True, depth, thresholds)
+    return Clip(items, sequence, depth, thresholds)
 
 
-def _known_about(folder: Path) -> tuple[DepthKind, dict[str, float]]:
-    """Return what the manifest of the data set around a scene's folder says about it, if there is one."""
+def _known_about(folder: Path) -> tuple[bool, DepthKind, dict[str, float]]:
+    """Return what the manifest of the data set around a scene's folder says about it, if there is one.
+
+    Whether its frames are one sequence, what depth means, and the limits for accumulation.
+    """
     try:
         manifest = FrameSet(folder.resolve().parent).manifest
     except (OSError, ValueError, json.JSONDecodeError):
-        return "euclidean", {}
+        return True, "euclidean", {}
     scene = manifest.scenes.get(folder.resolve().name)
-    return manifest.depth, dict(scene.thresholds) if scene else {}
+    if scene is None:
+        return True, manifest.depth, {}
+    return scene.sequence and len(scene.strands()) == 1, manifest.depth, dict(scene.thresholds)
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:

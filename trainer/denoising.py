@@ -236,7 +236,7 @@ class ClipDenoiser:
             frame = derive(frame, self._wanted(frame, model), depth_kind=self.clip.depth, previous=previous)
         except ValueError as error:
             hint = advice(model, self._fitting.has(frame, self.clip.depth, previous))
-            if not hint:
+            if not hint or hint in str(error):
                 raise
             raise ValueError(f"{error}; {hint}") from error
         exposure = self._choose_exposure(frame, follows)
@@ -287,12 +287,7 @@ class ClipDenoiser:
         return frame
 
     def _follows(self, frame: Frame) -> bool:
-        last = self._last
-        return (
-            self.clip.sequence
-            and last is not None
-            and (last.scene, last.index + 1) == (frame.scene, frame.index)
-        )
+        return self.clip.sequence and frame.follows(self._last)
 
     def _wanted(self, frame: Frame, model: Model) -> list[str]:
         names = [name for name in model.inputs if name != SAMPLES]

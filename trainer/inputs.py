@@ -9,6 +9,8 @@ from data.buffers import SAMPLES, buffer
 from data.camera import Camera, DepthKind
 from data.derive import obtainable
 from data.frame import Frame
+from models.denoiser import Denoiser
+from models.ops.halves import WRITTEN
 from trainer.loading import Model
 from trainer.options import options_of, spelled
 
@@ -75,7 +77,7 @@ class Fitting:
 
 
 def advice(model: Model, has: Collection[str]) -> str:
-    """Return which options of a method would do with the buffers that there are; empty where none would.
+    """Return what makes the buffers that are missing, and which options of a method would do without.
 
     Args:
         model: Whose inputs are missing.
@@ -86,7 +88,7 @@ def advice(model: Model, has: Collection[str]) -> str:
     # What has a variance or halves as well needs no option: `instead` takes it once the rest is settled.
     told = [n for n in missing if f"{n}_variance" in has or {f"{n}_a", f"{n}_b"} <= set(has)]
     alone = [name for name in missing if name in has and name not in told]
-    found = []
+    found = [WRITTEN] if "color_noise" in options and missing else []
     if "color" in alone and "color_noise" in options:
         found.append("--option color_noise=estimated estimates the noise of color from the image itself")
     features = [name for name in alone if name != "color"]
@@ -100,6 +102,8 @@ def advice(model: Model, has: Collection[str]) -> str:
     if absent and "features" in options and isinstance(used, (tuple, list)) and set(absent) <= set(used):
         rest = spelled([name for name in used if name not in absent])
         found.append(f"--option features={rest} does without {', '.join(absent)}")
+    if not found and missing and isinstance(model, Denoiser):
+        return model.made_by([name for name in model.inputs if name not in has])
     return "; ".join(found)
 
 

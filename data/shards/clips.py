@@ -105,9 +105,4 @@ def _parts(records: Sequence[FrameRecord]) -> list[list[FrameRecord]]:
 
 def _follows(before: FrameRecord, record: FrameRecord) -> bool:
     same_size = (before.width, before.height) == (record.width, record.height)
-    return same_size and _time(record) == _time(before) + 1
-
-
-def _time(record: FrameRecord) -> int:
-    """Return when a frame is; frames of one view with different samples per pixel are at the same time."""
-    return record.index if record.view is None else record.view
+    return same_size and record.moment == before.moment + 1

@@ -114,7 +114,7 @@ def _accumulated(
     frames: FrameSet, scene: str, options: PrepareOptions, wanted: set[int]
 ) -> Iterator[StoredFrame]:
     found = frames.manifest.scenes[scene]
-    accumulator = Accumulator(**found.thresholds)
+    accumulators: dict[int | None, Accumulator] = {}
     samples = options.samples != "none"
     needed = ("irradiance", "position", "normal", "motion", "depth", *_looked_at(options))
     for record in found.frames:
@@ -123,7 +123,10 @@ def _accumulated(
             scene, record.index, _stored(record, options), computed, samples=samples
         )
         if not frame.accumulated:
-            frame = accumulator.step(frame)
+            level = None if record.view is None else record.spp  # each is a sequence of its own
+            if level not in accumulators:
+                accumulators[level] = Accumulator(**found.thresholds)
+            frame = accumulators[level].step(frame)
             halves = {
                 name: planes for name, planes in halves.items() if name not in ("irradiance", "history")
             }

@@ -87,6 +87,7 @@ class RDFC(Denoiser):
             `visibility`; with `position` images are not cut into tiles. Empty: THIRD averages its window.
         window: Radius of the candidates' windows, 10 as the authors' default; a later port has 20.
         patches: Radii of the patches by which FIRST and SECOND compare colours.
+        patch: Radius of the patches of all other filters, whose weights are averaged over a radius one less.
         bandwidth: k of the colour.
         feature_bandwidth: k of the features.
         tau: Squared difference of a feature that always counts as small, of FIRST and SECOND.
@@ -122,6 +123,7 @@ class RDFC(Denoiser):
         *,
         window: int = 10,
         patches: Sequence[int] = (1, 3),
+        patch: int = 3,
         bandwidth: float = 0.45,
         feature_bandwidth: float = 0.6,
         tau: float = 1e-3,
@@ -176,12 +178,13 @@ class RDFC(Denoiser):
         )
         candidates = (Rule(small, tau), Rule(large, tau), Rule(None, third))
         self._candidates = PairKernel(given["window"], candidates, *bandwidths)
-        # Patches of radius 3, weights smoothed by one less: everything but the candidates.
-        self._prefilter = PairKernel(given["prefilter_window"], (Rule(3),), smoothing=2)
-        self._errors = PairKernel(given["error_window"], (Rule(3),), smoothing=2)
-        self._selection = PairKernel(given["selection_window"], (Rule(3),), smoothing=2)
+        patch, smoothing = given["patch"], max(0, given["patch"] - 1)
+        self._prefilter = PairKernel(given["prefilter_window"], (Rule(patch),), smoothing=smoothing)
+        self._errors = PairKernel(given["error_window"], (Rule(patch),), smoothing=smoothing)
+        self._selection = PairKernel(given["selection_window"], (Rule(patch),), smoothing=smoothing)
         window = max(1, given["window"] // 2) if second_window is None else second_window
-        self._second = PairKernel(window, (Rule(3, given["second_tau"]),), *bandwidths, 2, True)
+        second = (Rule(patch, given["second_tau"]),)
+        self._second = PairKernel(window, second, *bandwidths, smoothing, True)
 
     @staticmethod
     def _is_distance(name: str) -> bool:

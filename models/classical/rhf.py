@@ -15,6 +15,8 @@ Bins count where two pixels have more than one sample in them together. With one
 hardly any do, and nearly everything is accepted. With 8 a patch that differs in one corner is still accepted,
 since the few bins of one pixel are averaged with those of eight others; where that pixel is a lamp its light
 spreads over the window. The distance of different patches grows with the number of samples.
+
+Radiance and bins that are not finite count as 0; half precision is computed with in float32.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from torch import Tensor
 
 from data.buffers import HISTOGRAM, HISTOGRAM_MADE
 from models.denoiser import Buffers, Denoised, Denoiser
+from models.ops.guides import finite
 from models.ops.histogram import coarser_histogram, histogram_filter
 from models.ops.histogram_distance import HistogramKernel
 from models.ops.nlm import UNROLLED
@@ -80,7 +83,7 @@ class RHF(Denoiser):
         _, height, width = self.check(buffers)
         step = self.multiple
         padding = (0, -width % step, 0, -height % step)
-        color, histogram = (F.pad(buffers[name], padding, mode="replicate") for name in self.inputs)
+        color, histogram = (F.pad(finite(buffers[name]), padding, mode="replicate") for name in self.inputs)
         result = self._scale(color, histogram, self.scales, self.kernel)
         return Denoised(result[..., :height, :width])
 

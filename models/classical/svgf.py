@@ -111,6 +111,7 @@ class SVGF(SequenceFilter):
         taa_new: Weight of the new frame there.
         aux: Also return `history`, the number of frames, and `variance`, that of the luminance which entered
             the first iteration, in squared units of the irradiance, both (B, 1, H, W).
+        fused: Whether compiled kernels take over, None: where possible; see `models.ops.nlm.use_fused`.
 
     Raises:
         ValueError: A number is out of its range or a word unknown.
@@ -144,6 +145,7 @@ class SVGF(SequenceFilter):
         taa: bool = True,
         taa_new: float = 0.2,
         aux: bool = False,
+        fused: bool | None = None,
     ) -> None:
         arguments = {n: v for n, v in locals().items() if n not in ("self", "__class__")}
         super().__init__()
@@ -156,7 +158,7 @@ class SVGF(SequenceFilter):
         self.depth_limit, self.depth_floor = depth_limit, depth_floor
         self.normal_limit, self.normal_floor = normal_limit, normal_floor
         self.position_limit_squared, self.least_share = position_limit_squared, least_share
-        self.taa_new = taa_new if taa else None
+        self.taa_new, self.fused = (taa_new if taa else None), fused
         if geometry == "position":
             self.inputs = (*self.inputs, "position")
 
@@ -250,7 +252,8 @@ class SVGF(SequenceFilter):
         else:
             floor = RELATIVE_FLOOR * other if self.depth_floor is None else self.depth_floor
             same &= apart <= (self.depth_limit * (variation(other) + floor)).square()
-        return same & found.away_from_border(self.margin, (normal.shape[-2], normal.shape[-1]))
+        size = (normal.shape[-2], normal.shape[-1])
+        return same & found.away_from_border(self.margin, size) if self.margin else same
 
     def _with_variance(self, now: _Past, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
         """Return the colour and the variance of its luminance (B, 1, H, W); young pixels ask around."""
@@ -258,9 +261,9 @@ class SVGF(SequenceFilter):
         young = now.frames < self.young
         if not exporting() and not bool(young.any()):
             return now.color, variance
-        joined = torch.cat([now.color, now.moments], 1)
+        joined, taps = torch.cat([now.color, now.moments], 1), box_taps(_YOUNG_RADIUS)
         spread = now.frames.new_tensor(self.sigma_l)
-        around = edge_stopping_means(joined, joined[:, :0], spread, surfaces, box_taps(_YOUNG_RADIUS)).values
+        around = edge_stopping_means(joined, joined[:, :0], spread, surfaces, taps, fused=self.fused).values
         guessed = _variance(around[:, 3:]) * (self.young / now.frames)
         color = torch.where(young, around[:, :3], now.color) if self.prefilter else now.color
         return color, torch.where(young, guessed, variance)
@@ -271,7 +274,7 @@ class SVGF(SequenceFilter):
         for iteration in range(self.iterations):
             spread = self.sigma_l * (smoothed_variance(variance) + _LEAST_VARIANCE).sqrt()
             taps = atrous_taps(2**iteration)
-            color, variance = edge_stopping_means(color, variance, spread, surfaces, taps)
+            color, variance = edge_stopping_means(color, variance, spread, surfaces, taps, fused=self.fused)
             if iteration + 1 == self.feedback:
                 remembered = color
         return color, remembered

@@ -103,7 +103,7 @@ class WLR(Denoiser):
         aux: Return `bandwidth`, the shared one, and `directions`, the share that was kept, both (B, 1, H, W)
             in [0, 1], and with `prefilter` the filtered features as `Denoised.aux`.
         memory: Working memory in bytes beside the buffers; none: 64 MB on a CPU, 4 GB on other devices.
-        fused: Whether compiled kernels filter features, None: where possible; see `models.ops.nlm.use_fused`.
+        fused: Whether compiled kernels take over, None: where possible; see `models.ops.nlm.use_fused`.
     """
 
     frame_numbers = ("exposure",)
@@ -154,7 +154,8 @@ class WLR(Denoiser):
         self.noises: dict[str, Noise] = {"color": own, **of_features}
         self.inputs = tuple(n for base, noise in self.noises.items() for n in halves.inputs(base, noise))
         self.fireflies = checked("WLR", fireflies, own)
-        self.smoothing, self.variance_limit, self.aux, self.memory = smoothing, variance_limit, aux, memory
+        self.smoothing, self.variance_limit, self.aux = smoothing, variance_limit, aux
+        self.memory, self.fused = memory, fused
         self._prefilter = (
             Prefilter(prefilter_window, patch, final_window, "mean", memory, fused) if prefilter else None
         )
@@ -217,7 +218,11 @@ class WLR(Denoiser):
             color = limited_halves(color)
         features = {name: self._feature(buffers, name) for name in self.features}
         found = local_regression(
-            self._mean(color, self.noises["color"]), list(features.values()), self.rule, self.memory
+            self._mean(color, self.noises["color"]),
+            list(features.values()),
+            self.rule,
+            self.memory,
+            fused=self.fused,
         )
         used = {name: feature.image for name, feature in features.items()}
         return Details(found.color / exposure, found.bandwidth, found.rank, used)

@@ -15,6 +15,8 @@ here brightness above stays, unless the caller cuts it, since the result is to b
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -49,11 +51,17 @@ def antialiased(image: Tensor, last: Tensor, neighbours: Neighbours, new: float 
 def bounds(image: Tensor) -> tuple[Tensor, Tensor]:
     """Return low and high (B, C, H, W); pixels outside the image take no part."""
     around = F.pad(image, [1] * 4, mode="replicate")  # repeated pixels change no extremum
-    down = (around[..., :-2, 1:-1], image, around[..., 2:, 1:-1])
-    cross = torch.stack([*down, around[..., 1:-1, :-2], around[..., 1:-1, 2:]])
-    high_square = F.max_pool2d(around, 3, 1)
-    low_square = -F.max_pool2d(-around, 3, 1)
-    return 0.5 * (low_square + cross.amin(0)), 0.5 * (high_square + cross.amax(0))
+    low, high = (_extremum(around, choose) for choose in (torch.minimum, torch.maximum))
+    return low, high
+
+
+def _extremum(around: Tensor, choose: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Return the mean of the extremum of 3x3 pixels and of a cross; by rows and columns, not by pooling."""
+    column = choose(choose(around[..., :-2, :], around[..., 1:-1, :]), around[..., 2:, :])
+    middle = column[..., 1:-1]
+    square = choose(choose(column[..., :-2], middle), column[..., 2:])
+    cross = choose(choose(around[..., 1:-1, :-2], middle), around[..., 1:-1, 2:])
+    return 0.5 * (square + cross)
 
 
 def display(radiance: Tensor) -> Tensor:

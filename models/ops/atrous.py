@@ -11,20 +11,23 @@ direction times it, as in the paper (`along`). r says how different luminances m
 is k(0); pixels outside the image and those that hit nothing take no part.
 
 Works on images, one tap after the other, so that no array grows with the number of taps; on a CPU some rows
-at a time.
+at a time, or by compiled kernels where sigma_n is a power of 2 (`models.ops.fused.edges`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from models.ops.boxes import exporting
+from models.ops.nlm import use_fused
 from models.ops.slopes import slopes
 
 Slope = Literal["steepest", "along"]
@@ -87,14 +90,23 @@ class Surfaces:
         depth: (B, 1, H, W), 0 where nothing was hit.
         reach: Pixels to the farthest tap.
         stops: How different neighbours may be.
+
+    Attributes:
+        own: Normal, depth, slopes to the right and downwards (B, 6, H, W). Where nothing was hit, and
+            outside, a normal of 0 keeps pixels apart from all others.
+        around: Normal and depth with room around them.
     """
 
     def __init__(self, normal: Tensor, depth: Tensor, reach: int, stops: EdgeStops) -> None:
         self.reach, self.stops = reach, stops
         self.height, self.width = depth.shape[-2:]
-        # Where nothing was hit, and outside, a normal of 0 keeps pixels apart from all others.
-        self._own = torch.cat([normal * (depth > 0), depth, *slopes(depth)], 1)
-        self._around = self.padded(self._own[:, :4])
+        self.own = torch.cat([normal * (depth > 0), depth, *slopes(depth)], 1)
+        self.around = self.padded(self.own[:, :4])
+
+    def doublings(self) -> int | None:
+        """Return how often a cosine is squared to be raised to sigma_n, None where that is no power of 2."""
+        mantissa, exponent = math.frexp(self.stops.normal)
+        return exponent - 1 if mantissa == 0.5 and exponent >= 1 else None
 
     def padded(self, image: Tensor) -> Tensor:
         """Return an image with room around it, for `near`."""
@@ -112,7 +124,7 @@ class Surfaces:
             tap: The neighbour.
             rows: Which of the pixels.
         """
-        own, around = self._own[..., rows, :], self.near(self._around, tap, rows)
+        own, around = self.own[..., rows, :], self.near(self.around, tap, rows)
         alike = (own[:, :3] * around[:, :3]).sum(1, keepdim=True).clamp(0.0, 1.0).pow(self.stops.normal)
         right, down = own[:, 4:5], own[:, 5:]
         if self.stops.slope == "steepest":
@@ -136,7 +148,13 @@ class Means(NamedTuple):
 
 
 def edge_stopping_means(
-    values: Tensor, variances: Tensor, spread: Tensor, surfaces: Surfaces, taps: Sequence[Tap]
+    values: Tensor,
+    variances: Tensor,
+    spread: Tensor,
+    surfaces: Surfaces,
+    taps: Sequence[Tap],
+    *,
+    fused: bool | None = None,
 ) -> Means:
     """Return weighted means around every pixel.
 
@@ -146,12 +164,40 @@ def edge_stopping_means(
         spread: r, (B, 1, H, W) or a single number, positive.
         surfaces: What pixels show.
         taps: The neighbours, with the pixel itself.
+        fused: See `models.ops.nlm.use_fused`.
     """
     light = luminance(values[:, :3])
     around = surfaces.padded(torch.cat([light, values, variances], 1))
     spread = spread.expand_as(light)
+    if use_fused(fused, around, spread, surfaces.own) and surfaces.doublings() is not None:
+        return _fused_means(around, values.shape[1], spread, surfaces, taps)
     parts = [_means_of_rows(around, values.shape[1], spread, surfaces, taps, rows) for rows in _strips(light)]
     return Means(*(torch.cat(part, -2) for part in zip(*parts, strict=True)))
+
+
+def _fused_means(
+    around: Tensor, count: int, spread: Tensor, surfaces: Surfaces, taps: Sequence[Tap]
+) -> Means:
+    """Return what `edge_stopping_means` does, by compiled kernels."""
+    from models.ops import fused
+
+    places = np.array([(tap.down, tap.right) for tap in taps], np.int64)
+    kernels = np.array([tap.kernel for tap in taps], np.float32)
+    stops, found = surfaces.stops, []
+    for b in range(len(around)):
+        edges = fused.Edges(
+            surfaces.own[b].numpy(),
+            surfaces.around[b].numpy(),
+            surfaces.reach,
+            surfaces.doublings() or 0,
+            np.float32(stops.depth),
+            np.float32(_FLATTEST),
+            stops.slope == "steepest",
+        )
+        given = (around[b].numpy(), count, spread[b, 0].contiguous().numpy(), places, kernels)
+        found.append(torch.from_numpy(fused.edge_means(edges, *given, torch.get_num_threads())))
+    means = torch.stack(found)
+    return Means(means[:, :count], means[:, count:])
 
 
 def _means_of_rows(

@@ -56,10 +56,10 @@ SMOOTHING = 1
 ESTIMATE = 3
 """Radius of the box over which `estimated_variance` looks."""
 
-MADE = (
-    "`trainer render stills` writes halves and variances; color_noise=estimated needs color alone; "
-    "feature_noise=none takes features as they are"
-)
+WRITTEN = "`trainer render stills` writes halves and variances"
+"""What makes halves and variances."""
+
+MADE = f"{WRITTEN}; color_noise=estimated needs color alone; feature_noise=none takes features as they are"
 """What makes halves and variances, or does without."""
 
 _PARTS: dict[str, tuple[str, ...]] = {

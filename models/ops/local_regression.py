@@ -16,8 +16,9 @@ of samples, which stands on both sides there, cancels.
 
 A ridge keeps slopes finite. The constant has none, so that the l_q add up to 1 and a constant image stays
 constant. Windows are cut out whole for some pixels at a time, as many as the budget allows: all seven fits of
-a pixel then share its coordinates. Everything is in float64: kernels end abruptly, and a neighbour must not
-come and go with the rounding of its coordinates.
+a pixel then share its coordinates. Compiled kernels do the same pixel by pixel, with no more directions than
+are kept and no more neighbours than a trial reaches (`models.ops.fused.local`). Everything is in float64:
+kernels end abruptly, and a neighbour must not come and go with the rounding of its coordinates.
 
 U is taken as given where gradients are computed; eigenvectors have none where eigenvalues are equal.
 """
@@ -34,6 +35,7 @@ from torch import Tensor
 
 from models.ops.boxes import exporting
 from models.ops.feature_windows import Noisy, Stack, Windows, in_blocks
+from models.ops.nlm import use_fused
 from models.ops.shared_bandwidth import shared_bandwidth, smoothed
 
 _BUDGET = {"cpu": 64e6}
@@ -110,7 +112,12 @@ class Space(NamedTuple):
 
 
 def local_regression(
-    color: Noisy, features: Sequence[Noisy], rule: LocalRule, budget: float | None = None
+    color: Noisy,
+    features: Sequence[Noisy],
+    rule: LocalRule,
+    budget: float | None = None,
+    *,
+    fused: bool | None = None,
 ) -> Fitted:
     """Fit every pixel.
 
@@ -122,16 +129,23 @@ def local_regression(
         features: Each is scaled as one vector.
         rule: The numbers of the method.
         budget: Working memory in bytes beside inputs and results; None: 64 MB on a CPU, 4 GB elsewhere.
+        fused: See `models.ops.nlm.use_fused`; float64 is no hindrance here.
     """
     stack = Stack(color, features, rule.window)
+    tensors = (part for noisy in (color, *features) for part in noisy)
+    if use_fused(fused, *tensors, kinds=(torch.float32, torch.float64)):
+        from models.ops.local_bands import banded_regression
+
+        found = banded_regression(stack, rule, _BUDGET["cpu"] if budget is None else budget)
+        return Fitted(*(x.to(color.image.dtype) for x in found))
     pixels = 0 if exporting() else _pixels(stack, color.image.device, budget)
-    found = in_blocks(lambda *block: _estimated(stack.windows(*block), rule), stack.size[1:], pixels)
-    axes, kept, shape, shared = found
+    axes, kept, shape, shared = in_blocks(
+        lambda *block: _estimated(stack.windows(*block), rule), stack.size[1:], pixels
+    )
     smooth = smoothed(shared.permute(0, 3, 1, 2), rule.map_sigma, rule.map_reach)
 
     def last(rows: slice, columns: slice) -> tuple[Tensor, ...]:
-        windows = stack.windows(rows, columns)
-        parts = (axes, kept, shape, smooth.permute(0, 2, 3, 1))
+        windows, parts = stack.windows(rows, columns), (axes, kept, shape, smooth.permute(0, 2, 3, 1))
         own_axes, own_kept, own_shape, h = (x[:, rows, columns].flatten(0, 2) for x in parts)
         near = neighbours(windows, Space(own_axes, own_kept), own_shape, rule)
         return (windows.maps(fitted(windows, near, h, rule)[0]),)

@@ -286,7 +286,7 @@ def guide_parts(guides: Sequence[Guide], kernel: PatchKernel) -> tuple[list[Tens
     return [g.image for g in guides], [g.variance * kernel.scale for g in guides]
 
 
-def use_fused(wanted: bool | None, *tensors: Tensor) -> bool:
+def use_fused(wanted: bool | None, *tensors: Tensor, kinds: Sequence[torch.dtype] = (torch.float32,)) -> bool:
     """Say whether the kernels of `models.ops.fused` take over from the PyTorch form.
 
     They need float32 on the CPU, no gradient, no export, and Numba.
@@ -295,6 +295,7 @@ def use_fused(wanted: bool | None, *tensors: Tensor) -> bool:
         wanted: None: where possible. False: never. True: wherever the tensors allow it, and Numba must be
             there.
         tensors: What is to be worked on.
+        kinds: Types of tensors that the kernels work on.
 
     Raises:
         ValueError: `wanted` is True and Numba is not installed.
@@ -306,7 +307,7 @@ def use_fused(wanted: bool | None, *tensors: Tensor) -> bool:
         )
     if wanted is False or exporting():
         return False
-    plain = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+    plain = all(t.dtype in kinds and t.device.type == "cpu" for t in tensors)
     tracked = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     return plain and not tracked and _has_numba()
 

@@ -2,7 +2,8 @@
 
 Graphics hardware takes differences within squares of 2x2 pixels, so that at a silhouette every second pixel
 sees a cliff where its own surface is flat. Here the differences from the neighbour before and to the one
-behind are compared, and the smaller one counts: of the two sides of a pixel one lies on its own surface.
+behind are compared, and the smaller one counts: of the two sides of a pixel one lies on its own surface. At
+the border of the image it is compared with the next pair's.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def _along(image: Tensor, axis: int) -> Tensor:
     if count == 0:
         return torch.zeros_like(image)
     difference = image.diff(dim=axis)
-    # At the border there is one neighbour only, and its difference stands for both.
-    behind = torch.cat([difference, difference.narrow(axis, count - 1, 1)], axis)
-    before = torch.cat([difference.narrow(axis, 0, 1), difference], axis)
+    # At the border there is one neighbour only: the next difference stands for the one that is missing, or
+    # the cliff between a last pixel and its neighbour would be a slope.
+    behind = torch.cat([difference, difference.narrow(axis, max(count - 2, 0), 1)], axis)
+    before = torch.cat([difference.narrow(axis, min(count - 1, 1), 1), difference], axis)
     return torch.where(behind.abs() < before.abs(), behind, before)

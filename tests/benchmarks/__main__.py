@@ -25,7 +25,9 @@ MODULES = (
     *("rendering", "procedural"),
     *("afgsa", "afgsa_search", "afgsa_inference", "acfm", "kpcn", "kp", "nbgd", "realtime", "stills_quality"),
     *("splat", "per_sample", "stages", "per_sample_quality", "exported"),
-    *("nfor", "nfor_growth", "nlm", "rdfc", "rhf", "lbf", "classical_quality", "flicker"),
+    *("nfor", "nfor_growth", "nlm", "rdfc", "rhf", "lbf"),
+    *("classical_quality", "sequence_quality", "flicker"),
+    *("classical_cost", "classical_plain", "frame_limit"),
     *("scaling", "remote", "outage", "serve"),
     "evaluation",
 )

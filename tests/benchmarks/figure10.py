@@ -2,7 +2,8 @@
 
 A thin line is one still at one number of samples per pixel; dots are means, bars one standard deviation on
 either side. MSE and relMSE are given as multiples of the best method's value (logarithmic axis), PSNR and
-SSIM as differences from it, so that the best is at 1 or at 0.
+SSIM as differences from it, so that the best is at 1 or at 0. A still that lacks a method is compared without
+it, and does not count for it.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ UNITS = {"MSE": "", "relMSE": "", "PSNR": " dB", "SSIM": ""}
 
 
 def panel(stills: Sequence[Scores], metric: str, methods: Sequence[str]) -> Panel:
-    """Return the distances of methods to the best of them in each still that has all of them."""
+    """Return the distances of methods to the best of those that a still has, still by still."""
     higher = METRICS[metric] == DIFFERENCE
-    values = [{method: scores[method][metric] for method in methods if method in scores} for scores in stills]
-    return Panel(metric, higher, UNITS[metric].strip(), distances(values, methods, higher))
+    found: dict[str, list[float]] = {method: [] for method in methods}
+    for scores in stills:
+        values = {name: scores[name][metric] for name in methods if name in scores}
+        for name, apart in distances([values], list(values), higher).items():
+            found[name] += apart
+    return Panel(metric, higher, UNITS[metric].strip(), found)
 
 
 def summary(stills: Sequence[Scores], metric: str, methods: Sequence[str]) -> dict[str, Distance]:
-    """Return method → mean and standard deviation of its distances."""
+    """Return method → mean and standard deviation of its distances, over the stills that it has."""
     found = panel(stills, metric, methods).values
     return {method: Distance.of(values) for method, values in found.items()}
 
@@ -60,10 +65,25 @@ def verdict(stills: Sequence[Scores], metric: str, methods: Sequence[str], ours:
     )
 
 
+def drawn(blocks: Mapping[str, Sequence[Scores]], methods: Sequence[str]) -> dict[str, list[Panel]]:
+    """Return the rows of panels: of each block the methods that all stills have, on all stills.
+
+    Where some stills lack a method there is a second row, of all methods on the stills that have them all.
+    """
+    rows = {}
+    for title, stills in blocks.items():
+        every = [name for name in methods if any(name in scores for scores in stills)]
+        always = [name for name in every if all(name in scores for scores in stills)]
+        common = [scores for scores in stills if set(every) <= set(scores)]
+        rows[title] = [panel(stills, metric, always) for metric in METRICS]
+        if len(always) < len(every) and common:
+            rows[f"{title}, where all methods have their buffers"] = [
+                panel(common, metric, every) for metric in METRICS
+            ]
+    return rows
+
+
 def draw(blocks: Mapping[str, Sequence[Scores]], methods: Sequence[str], path: Path) -> None:
-    """Draw one row of panels per block (title → stills) into a PNG."""
+    """Draw the rows of panels (`drawn`) of blocks (title → stills) into a PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure = distance_figure(
-        {title: [panel(stills, metric, methods) for metric in METRICS] for title, stills in blocks.items()}
-    )
-    figure.savefig(path, dpi=110)
+    distance_figure(drawn(blocks, methods)).savefig(path, dpi=110)

@@ -71,10 +71,17 @@ def with_samples(made: Frame, count: int, depth: bool = False, bright: float = 0
     return replace(made, samples=Samples.of(parts))
 
 
-def write_stills(root: Path, views: int = 4, levels: tuple[int, ...] = (4, 8), samples: bool = False) -> Path:
+def write_stills(
+    root: Path,
+    views: int = 4,
+    levels: tuple[int, ...] = (4, 8),
+    samples: bool = False,
+    path: bool = False,
+) -> Path:
     """Write a set of stills: each view once for each number of samples per pixel, one frame after the other.
 
-    Views of the training scenes `hall` and `roof`; with `samples`, they are kept apart.
+    Views of the training scenes `hall` and `roof`; with `samples`, they are kept apart; with `path`, they
+    are those of a moving camera.
     """
     scenes = {}
     for scene in ("hall", "roof"):
@@ -85,7 +92,7 @@ def write_stills(root: Path, views: int = 4, levels: tuple[int, ...] = (4, 8), s
             if samples:
                 made = with_samples(made, levels[index % len(levels)])
             records.append(write_record(made, root))
-        scenes[scene] = SceneRecord(tuple(records), sequence=False)
+        scenes[scene] = SceneRecord(tuple(records), sequence=path)
     splits: dict[str, list[str]] = {"train": ["hall", "roof"], "validation": [], "test": []}
     Manifest("stills", "penumbra", "euclidean", splits, scenes).save(root)
     return root

@@ -44,6 +44,18 @@ def test_require_names_what_is_missing_and_what_is_there():
         frame.require("color", "normal", "depth")
 
 
+def test_a_frame_follows_the_one_before_of_its_scene_or_that_of_the_view_before_with_as_many_samples():
+    def of(index, view=None, spp=4, scene="hall"):
+        notes = {} if view is None else {"view": view}
+        return Frame({"color": image()}, scene, index, spp=spp, notes=notes)
+
+    assert of(3).follows(of(2, spp=8))
+    assert not any(of(3).follows(last) for last in (None, of(1), of(3), of(4), of(2, scene="roof")))
+    assert of(2, view=1).follows(of(0, view=0))
+    assert not of(1, view=0, spp=8).follows(of(0, view=0))
+    assert not of(2, view=1).follows(of(1, view=0, spp=8))
+
+
 def test_with_buffers_leaves_the_original_alone():
     frame = Frame({"color": image()}, "room", 0)
     changed = frame.with_buffers(normal=image())

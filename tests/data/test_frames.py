@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 
 from data.derive import remodulate
 from data.frames import FrameSet
-from data.ingestion import IngestOptions, ingest
+from data.ingestion import IngestOptions, ingest, write_record
 from data.manifest import MANIFEST
 from tests.data.miniature import ingested, penumbra_scene
 
@@ -64,6 +65,27 @@ def test_motion_is_derived_along_a_sequence(tmp_path):
     motions = [f.buffers["motion"] for f in FrameSet(tmp_path / "set").sequence("classroom", ["motion"])]
     assert (np.abs(motions[0]) < 1e-3).all()
     assert 0.3 < np.median(np.abs(motions[1]).max(-1)) < 5
+
+
+def test_motion_along_a_path_with_several_numbers_of_samples_is_that_from_view_to_view(tmp_path):
+    penumbra_scene(tmp_path / "source", "classroom", 3)
+    options = IngestOptions(buffers=("color", "normal", "position", "diffuse_albedo"))
+    ingest("penumbra", tmp_path / "source", tmp_path / "set", options)
+    single = FrameSet(tmp_path / "set")
+    expected = {f.index: f.buffers["motion"] for f in single.sequence("classroom", ["motion"])}
+    records = []
+    for index in range(6):
+        made = replace(single.read("classroom", index // 2), index=index, spp=4 * (1 + index % 2))
+        made.notes["view"] = index // 2
+        records.append(write_record(made, tmp_path / "both"))
+    scene = replace(single.manifest.scenes["classroom"], frames=tuple(records))
+    replace(single.manifest, scenes={"classroom": scene}).save(tmp_path / "both")
+    found = {
+        f.index: f.buffers["motion"] for f in FrameSet(tmp_path / "both").sequence("classroom", ["motion"])
+    }
+    assert list(found) == [0, 2, 4, 1, 3, 5]
+    for index, motion in found.items():
+        np.testing.assert_allclose(motion, expected[index // 2], atol=1e-3)
 
 
 def test_unknown_scenes_and_frames_are_named_with_the_known_ones(root):

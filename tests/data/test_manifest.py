@@ -138,3 +138,12 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_else(tmp_path, mon
         write_json(tmp_path / "x.json", {"a": 2})
     assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
     assert json.loads((tmp_path / "x.json").read_text()) == {"a": 1}
+
+
+def test_a_path_with_several_numbers_of_samples_is_a_sequence_for_each_and_all_else_is_one_list():
+    both = tuple(record(2 * view + level, view=view, spp=4**level) for view in range(3) for level in range(2))
+    assert SceneRecord(both).strands() == [both[::2], both[1::2]]
+    assert SceneRecord(both, sequence=False).strands() == [both]
+    assert SceneRecord(both[::2]).strands() == [both[::2]]
+    plain = (record(0), record(1))
+    assert SceneRecord(plain).strands() == [plain]

@@ -392,6 +392,15 @@ def test_a_root_is_prepared_here_by_recipe_and_samples_per_pixel(tmp_path: Path)
     assert Shards(str(root), recipe="layers").options.train_patches == 56
 
 
+@pytest.mark.parametrize(("levels", "independent"), [((4,), ()), ((4, 8), ("hall", "roof"))])
+def test_frames_of_one_view_do_not_follow_one_another(
+    tmp_path: Path, levels: tuple[int, ...], independent: tuple[str, ...]
+):
+    root = write_stills(tmp_path / "frames", 2, levels, path=True)
+    data = Shards(str(prepare(root, tmp_path / "shards", OPTIONS).root), 2, 0)
+    assert data.independent_views("train") == independent
+
+
 def test_training_batches_keep_a_random_number_of_samples_and_evaluation_all(tmp_path: Path):
     index = stills(tmp_path)
     data = Shards(str(index.root), 2, 0, buffers=("samples",), sample_counts=(2, 8))

@@ -26,7 +26,7 @@ from data.shards.options import PrepareOptions, recipe_options
 from data.shards.planes import Planes
 from data.shards.prepare import cached_path, prepare, prepare_cached
 from data.shards.read import CorruptSampleError, ShardReader
-from tests.data.small_sets import OPTIONS, frame, with_samples, write_set
+from tests.data.small_sets import OPTIONS, frame, with_samples, write_set, write_stills
 from tests.data.test_shards_read import copy, flip_byte
 from tests.trainer.test_prepare import command
 
@@ -285,6 +285,25 @@ def test_a_clip_is_left_out_only_where_all_its_references_are_black(tmp_path: Pa
     made = prepare(black, tmp_path / "left", CLIPS)
     assert made.scenes("train") == ["roof"]
     assert made.skipped == made.count("train") + made.count("validation")
+
+
+def test_each_number_of_samples_of_a_path_is_accumulated_by_itself(tmp_path: Path):
+    index = prepare(write_stills(tmp_path / "frames", 3, (4, 8), path=True), tmp_path / "shards", OPTIONS)
+    whole = [FrameSet(index.root.parent / "frames").read("hall", i).buffers["irradiance"] for i in range(6)]
+    reader = ShardReader(index, "train")
+    seen = set()
+    for number in range(len(reader)):
+        sample = reader.sample(number)
+        if sample.scene != "hall":
+            continue
+        seen.add(sample.frame)
+        x, y = place_of(reader.array(number, "depth")[0].numpy())
+        before = range(sample.frame % 2, sample.frame + 1, 2)  # as many samples, one view after the other
+        assert (reader.array(number, "history") == len(before)).all()
+        mean = np.mean([whole[i][y : y + 16, x : x + 16] for i in before], axis=0)
+        found = reader.array(number, "irradiance").numpy().transpose(1, 2, 0)
+        assert np.allclose(found, mean, rtol=2e-3, atol=1e-4)
+    assert len(seen) > 3
 
 
 def test_accumulated_clips_hold_the_history_of_each_frame(frames: Path, tmp_path: Path):

@@ -149,6 +149,17 @@ def test_history_starts_anew_when_a_frame_does_not_follow(change):
     assert np.array_equal(result.buffers["irradiance"], other.buffers["irradiance"])
 
 
+def test_a_view_with_more_samples_has_no_history_and_the_next_view_with_as_many_has():
+    first, second = still(2)
+    views = [
+        replace(first, spp=4, notes={"view": 0}),
+        replace(second, spp=8, notes={"view": 0}),
+        replace(second, spp=8, index=2, notes={"view": 1}),
+    ]
+    counts = [frame.buffers["history"].max() for frame in accumulate(views)]
+    assert counts == [1, 1, 2]
+
+
 def test_a_moved_surface_and_a_turned_normal_lose_their_history():
     first, second = still(2)
     position, normal = second.buffers["position"].copy(), second.buffers["normal"].copy()

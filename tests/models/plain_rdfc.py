@@ -153,9 +153,11 @@ def blurred(image: Array) -> Array:
     return result
 
 
-def filtered_feature(a: Array, b: Array, variance: Array, radius: int, unit: float = 1.0) -> Feature:
+def filtered_feature(
+    a: Array, b: Array, variance: Array, radius: int, unit: float = 1.0, patch: int = 3
+) -> Feature:
     """Filter both halves with the weights of their mean."""
-    guide, how = ((a + b) / 2, variance), Filter(radius, 3, 2)
+    guide, how = ((a + b) / 2, variance), Filter(radius, patch, patch - 1)
     a, b = run(a, guide, how).image, run(b, guide, how).image
     return Feature((a + b) / 2, blurred((a - b) ** 2 / 4), unit)
 
@@ -166,6 +168,7 @@ class Numbers:
 
     window: int = 10
     patches: tuple[int, int] = (1, 3)
+    patch: int = 3
     k: float = 0.45
     k_feature: float = 0.6
     tau: float = 1e-3
@@ -201,7 +204,9 @@ def rdfc(a: Array, b: Array, variance: Array, features: Sequence[Feature], n: Nu
         sure = ((pair[0] + pair[1]) / 2 - color) ** 2 + 2 * variance * slope - variance
         halves.append(pair)
         slopes.append(slope.mean(-1))
-        errors.append(run(sure.mean(-1)[..., None], guide, Filter(n.error_window, 3, 2)).image[..., 0])
+        errors.append(
+            run(sure.mean(-1)[..., None], guide, Filter(n.error_window, n.patch, n.patch - 1)).image[..., 0]
+        )
     maps = np.zeros((*color.shape[:2], 3))
     for y in range(color.shape[0]):
         for x in range(color.shape[1]):
@@ -212,14 +217,15 @@ def rdfc(a: Array, b: Array, variance: Array, features: Sequence[Feature], n: Nu
             if allowed and errors[0][y, x] < least:
                 best = 0
             maps[y, x, best] = 1
+    select = Filter(n.selection_window, n.patch, n.patch - 1)
     shares = np.stack(
-        [run(maps[..., i : i + 1], guide, Filter(n.selection_window, 3, 2)).image[..., 0] for i in range(3)],
+        [run(maps[..., i : i + 1], guide, select).image[..., 0] for i in range(3)],
         -1,
     )
     shares /= shares.sum(-1, keepdims=True)
     mixed = [sum(shares[..., i, None] * halves[i][side] for i in range(3)) for side in range(2)]
     mix = np.asarray((mixed[0] + mixed[1]) / 2)
     left = blurred((mixed[0] - mixed[1]) ** 2 / 4)
-    second = Filter(n.second_window, 3, 2, n.k, n.k_feature, n.second_tau, True)
+    second = Filter(n.second_window, n.patch, n.patch - 1, n.k, n.k_feature, n.second_tau, True)
     both = [run(half, (mix, left), second, features).image for half in mixed]
     return Steps(np.asarray((both[0] + both[1]) / 2), np.stack(errors, -1), shares, mix)

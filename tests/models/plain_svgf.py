@@ -37,13 +37,20 @@ def grey(color: Array) -> float:
 
 
 def slope(image: Array, y: int, x: int, down: int, right: int) -> Array:
-    """Return the smaller of the differences to both neighbours along an axis, per channel."""
-    height, width = image.shape[:2]
+    """Return the smaller of the differences to both neighbours along an axis, per channel.
+
+    Where one of them is missing, the difference of the other one from the next is taken instead.
+    """
     found = []
-    if y + down < height and x + right < width:
-        found.append(image[y + down, x + right] - image[y, x])
-    if y - down >= 0 and x - right >= 0:
-        found.append(image[y, x] - image[y - down, x - right])
+    for side in (1, -1):
+        for step in (0, -2 * side):
+            q, other = (
+                (y + step * down, x + step * right),
+                (y + (step + side) * down, x + (step + side) * right),
+            )
+            if inside(image, q) and inside(image, other):
+                found.append(side * (image[other] - image[q]))
+                break
     if not found:
         return np.zeros(image.shape[2])
     return np.array([min((f[c] for f in found), key=abs) for c in range(image.shape[2])])

@@ -198,6 +198,7 @@ def test_colour_alone_is_an_error_that_names_the_options(tmp_path: Path) -> None
         nfor(source, tmp_path / "out")
     text = str(error.value)
     assert "--option color_noise=estimated estimates the noise of color from the image itself" in text
+    assert "; `trainer render stills` writes halves and variances; " in text
     assert "--option feature_noise=none takes normal as free of noise" in text
     assert str(source) in text
     assert "\n" not in text
@@ -209,6 +210,13 @@ def test_an_absent_feature_is_an_error_that_names_the_option_without_it(tmp_path
     given = ("--model", "NFOR", "--output", tmp_path / "out")
     with pytest.raises(ValueError, match="--option features=normal does without albedo, depth"):
         run(source, *given, options=SMALL)
+
+
+def test_a_missing_histogram_is_an_error_that_names_the_commands_once(tmp_path: Path) -> None:
+    source = write(tmp_path / "in" / "f0.exr", frame("color"))
+    with pytest.raises(ValueError, match="missing buffer 'histogram'") as error:
+        run(source, "--model", "RHF", "--output", tmp_path / "out")
+    assert str(error.value).count("trainer render stills --histogram writes histograms") == 1
 
 
 def test_what_has_a_variance_is_not_to_be_estimated(tmp_path: Path) -> None:

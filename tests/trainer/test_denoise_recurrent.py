@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import torch
 from torch import Tensor
 
 from data.exr import read_frame
+from data.ingestion import write_record
+from data.manifest import Manifest, SceneRecord
 from models import RAE, SVGF
 from models.denoiser import State
 from tests.trainer.test_denoise_classical import frame, run, write
@@ -150,8 +153,65 @@ def test_a_later_frame_without_motion_is_refused(tmp_path: Path) -> None:
     names = tuple(name for name in SVGF.inputs if name != "motion")
     for index in range(2):
         write(tmp_path / "in" / f"f{index:03d}.exr", frame(*names, size=SIZE, seed=index, index=index))
-    with pytest.raises(ValueError, match="missing buffer 'motion'"):
+    with pytest.raises(
+        ValueError,
+        match=r"missing buffer 'motion'.*; SVGF works on sequences: `trainer render sequences` writes",
+    ):
         run(tmp_path / "in", "--model", "SVGF", "--output", tmp_path / "out")
+
+
+def path_of_two_levels(root: Path, sequence: bool = True) -> list[dict[str, Tensor]]:
+    """Write a camera path whose views have 4 and 8 samples per pixel; returns what SVGF reads of all."""
+    records, given = [], []
+    for index in range(6):
+        made = replace(
+            frame(*INPUTS, "reference", size=SIZE, seed=index, index=index), spp=4 + 4 * (index % 2)
+        )
+        made.buffers["motion"] = np.full((*SIZE, 2), 0.25, np.float32)
+        made.notes["view"] = index // 2
+        records.append(write_record(made, root))
+        read = read_frame(root / records[-1].file).buffers
+        given.append({n: torch.from_numpy(read[n].transpose(2, 0, 1).copy())[None] for n in SVGF.inputs})
+    scenes = {"surface": SceneRecord(tuple(records), sequence)}
+    Manifest("set", "render", "euclidean", {"train": [], "validation": [], "test": ["surface"]}, scenes).save(
+        root
+    )
+    return given
+
+
+def test_a_path_with_several_numbers_of_samples_is_a_sequence_for_each(tmp_path: Path) -> None:
+    given = path_of_two_levels(tmp_path / "in")
+    assert run(tmp_path / "in", "--model", "SVGF", "--output", tmp_path / "out", "--exposure", "1") == 0
+    for level in (0, 1):
+        state: State | None = None
+        for index in range(level, 6, 2):
+            color, state, _ = SVGF()(given[index], state)
+            found = read_frame(tmp_path / "out" / "surface" / f"f{index:03d}.exr").buffers["color"]
+            close(found, color[0].permute(1, 2, 0).numpy())
+
+
+def test_files_of_a_set_of_independent_views_are_no_sequence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = path_of_two_levels(tmp_path / "in", sequence=False)
+    files = sorted((tmp_path / "in" / "surface").glob("*.exr"))[::2]
+    assert run(*files, "--model", "SVGF", "--output", tmp_path / "out", "--exposure", "1") == 0
+    assert "the frames are independent views" in capsys.readouterr().err
+    for place, path in enumerate(files):
+        color = SVGF()(given[2 * place]).color
+        found = read_frame(tmp_path / "out" / path.name).buffers["color"]
+        close(found, color[0].permute(1, 2, 0).numpy())
+
+
+def test_files_of_one_view_with_several_numbers_of_samples_are_no_sequence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = path_of_two_levels(tmp_path / "in")
+    files = sorted((tmp_path / "in" / "surface").glob("*.exr"))[:2]
+    assert run(*files, "--model", "SVGF", "--output", tmp_path / "out", "--exposure", "1") == 0
+    assert "the frames are independent views" in capsys.readouterr().err
+    color = SVGF()(given[1]).color
+    close(read_frame(tmp_path / "out" / "f001.exr").buffers["color"], color[0].permute(1, 2, 0).numpy())
 
 
 def test_files_name_their_state_and_how_a_sequence_starts(files: dict[str, Path]) -> None:

@@ -190,7 +190,7 @@ class Worker:
             self.say(f"{frame.label}: {replaced}", "warning")
         if "reference" in frame.buffers:
             write_image(self.images / REFERENCE / f"{item.name}.exr", frame.buffers["reference"])
-        if previous is None or (previous.scene, previous.index + 1) != (frame.scene, frame.index):
+        if previous is None or not frame.follows(previous):
             return facts
         from trainer.metrics.temporal import places_before
 

@@ -87,16 +87,15 @@ def make_jobs(frames: FrameSet) -> list[FrameJob]:
     jobs = []
     for number, (name, scene) in enumerate(manifest.scenes.items()):
         shown, columns = shown_frame(scene), column_frames(scene)
-        first, second = [*scene.frames, None][:2] if scene.sequence else (None, None)
+        first, second = [*scene.strands()[0], None][:2] if scene.sequence else (None, None)
         for record in scene.frames:
             pictures: Pictures = "none"
             if record.index == shown.index:
                 pictures = "all" if number < whole else "main"
             large = record.index == shown.index and max(record.width, record.height) > limit
             column = large or any(record.index == c.index for c in columns)
-            before = (
-                first.file if first and second and record.index == second.index == first.index + 1 else ""
-            )
+            follows = first and second and record is second and second.moment == first.moment + 1
+            before = first.file if first and follows else ""
             jobs.append(FrameJob(str(frames.root), name, record, pictures, limit, column, before))
     return jobs
 

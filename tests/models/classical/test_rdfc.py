@@ -33,7 +33,7 @@ def doubled(buffers: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: image.double() for name, image in buffers.items()}
 
 
-def plain_features(buffers: dict[str, Tensor], radius: int) -> list[plain_rdfc.Feature]:
+def plain_features(buffers: dict[str, Tensor], radius: int, patch: int = 3) -> list[plain_rdfc.Feature]:
     """Return normal, albedo and depth as RDFC normalises and filters them, without its code."""
     found = []
     for name in NAMES:
@@ -46,7 +46,7 @@ def plain_features(buffers: dict[str, Tensor], radius: int) -> list[plain_rdfc.F
             a, b, variance = a * scale, b * scale, variance * scale**2
         if name == "depth":
             unit = float(((a + b) / 2).max())
-        found.append(plain_rdfc.filtered_feature(a, b, variance, radius, unit))
+        found.append(plain_rdfc.filtered_feature(a, b, variance, radius, unit, patch))
     return found
 
 
@@ -100,6 +100,15 @@ def test_a_rendered_still_equals_the_transcription() -> None:
     largest = np.abs(expected.color).max()
     assert np.abs(as_rows(RDFC(**SMALL)(doubled(given)).color) - expected.color).max() < 1e-10 * largest
     assert np.abs(as_rows(RDFC(**SMALL)(given).color) - expected.color).max() < 1e-4 * largest
+
+
+def test_other_patches_of_the_filters_around_the_candidates_equal_the_transcription(
+    buffers: dict[str, Tensor],
+) -> None:
+    given = doubled(buffers)
+    numbers = plain_rdfc.Numbers(**{**vars(NUMBERS), "patch": 1})
+    expected = plain_rdfc.rdfc(*color_parts(given), plain_features(given, 2, 1), numbers)
+    assert np.abs(as_rows(RDFC(**SMALL, patch=1)(given).color) - expected.color).max() < 1e-10
 
 
 def test_features_without_noise_and_a_colour_without_halves_equal_the_transcription(

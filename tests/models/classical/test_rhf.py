@@ -150,6 +150,22 @@ def test_broken_histograms_count_as_none() -> None:
     assert RHF()(broken).color.isfinite().all()
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_radiance_that_is_not_finite_counts_as_0(value: float) -> None:
+    buffers = buffers_of(noisy(16, 17))
+    broken, black = ({**buffers, "color": buffers["color"].clone()} for _ in range(2))
+    broken["color"][..., 5, 6], black["color"][..., 5, 6] = value, 0.0
+    assert torch.equal(RHF()(broken).color, RHF()(black).color)
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16], ids=str)
+def test_half_precision_is_computed_with_in_float32(kind: torch.dtype) -> None:
+    rounded = {name: image.to(kind) for name, image in buffers_of(noisy(16, 17)).items()}
+    found = RHF()(rounded).color
+    assert found.dtype == torch.float32
+    assert torch.equal(found, RHF()({name: image.float() for name, image in rounded.items()}).color)
+
+
 def test_gradients_of_the_image_are_those_of_fixed_weights() -> None:
     buffers = buffers_of(noisy(4, 3))
     kernel = HistogramKernel(1, 1, 0.8, 1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from models.classical.bmfr import BMFR
 from models.classical.sequence_filter import SequenceFilter
 from models.classical.svgf import SVGF
-from tests.models.sequences import at_rest, damages, joined, run, sequence
+from tests.models.sequences import at_rest, damages, joined, run, sequence, tensors, walk
 
 pytestmark = pytest.mark.usefixtures("one_thread", "no_gradients")
 
@@ -46,6 +47,29 @@ def test_noise_goes_down_within_a_frame_and_from_frame_to_frame(network: Sequenc
     noisy = (frames[0]["irradiance"] * frames[0]["albedo"] - clean)[seen].square().mean().item()
     assert errors[0] < 0.3 * noisy
     assert errors[-1] < 0.5 * errors[0]
+
+
+def surfaces(buffers: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Return which surface each pixel shows, (H, W): sky 0, wall 1, board 2."""
+    depth = buffers["depth"][0, 0]
+    wall = (8 + 0.2 * torch.arange(len(depth), dtype=depth.dtype))[:, None]
+    return torch.where(depth == 0, 0, torch.where((depth - wall).abs() < 1e-9, 1, 2))
+
+
+@pytest.mark.parametrize("step", [0.4, 0.8, 1.6, 3.0])
+def test_what_comes_into_view_has_no_history(network: SequenceFilter, step: float) -> None:
+    first, second = (tensors(buffers) for buffers in walk(2, 20, 24, step))
+    before, now, motion = surfaces(first), surfaces(second), second["motion"][0]
+    known = torch.zeros_like(now, dtype=torch.bool)
+    for y, x in np.ndindex(*now.shape):  # nothing near where the pixel was shows its surface
+        place = x + float(motion[0, y, x])
+        near = [(y + j, round(place) + i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+        inside = [q for q in near if 0 <= q[0] < now.shape[0] and 0 <= q[1] < now.shape[1]]
+        known[y, x] = any(before[q] == now[y, x] for q in inside)
+    count = network(second, network(first).state).state["count"][0, 0]
+    assert (~known).sum() > 3
+    assert (count[~known] == 1).all()
+    assert (count[known] == 2).double().mean() > 0.8
 
 
 def test_a_state_is_detached_and_all_that_is_needed(network: SequenceFilter) -> None:

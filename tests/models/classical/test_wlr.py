@@ -66,8 +66,11 @@ def relative(found: Tensor, expected: Any) -> float:
     return float(np.abs(image(found) - expected).max() / (expected.max() - expected.min()))
 
 
-def test_every_step_equals_the_transcription(buffers: dict[str, Tensor], expected: plain_wlr.Steps) -> None:
-    found = WLR(window=3).details(buffers)
+@pytest.mark.parametrize("fused", [False, True])
+def test_every_step_equals_the_transcription(
+    buffers: dict[str, Tensor], expected: plain_wlr.Steps, fused: bool
+) -> None:
+    found = WLR(window=3, fused=fused).details(buffers)
     assert set(np.unique(expected.rank)) >= {2, 3, 4}
     assert 0.1 < (expected.first < 1).mean() < 0.9
     assert (image(found.rank)[..., 0] == expected.rank).all()
@@ -75,41 +78,62 @@ def test_every_step_equals_the_transcription(buffers: dict[str, Tensor], expecte
     assert relative(found.color, expected.color) < 1e-9
 
 
-def test_float32_buffers_give_the_same_image(buffers: dict[str, Tensor], expected: plain_wlr.Steps) -> None:
-    found = WLR(window=3)(single(buffers)).color
+@pytest.mark.parametrize("fused", [False, True])
+def test_float32_buffers_give_the_same_image(
+    buffers: dict[str, Tensor], expected: plain_wlr.Steps, fused: bool
+) -> None:
+    found = WLR(window=3, fused=fused)(single(buffers)).color
     assert found.dtype == torch.float32
     assert relative(found, expected.color) < 1e-5
 
 
 @pytest.mark.slow
 def test_the_published_window_equals_the_transcription(buffers: dict[str, Tensor]) -> None:
-    assert relative(WLR()(buffers).color, transcription(buffers, 9).color) < 1e-9
+    expected = transcription(buffers, 9).color
+    for fused in (False, True):
+        assert relative(WLR(fused=fused)(buffers).color, expected) < 1e-9
 
 
-def test_memory_changes_nothing_but_memory(buffers: dict[str, Tensor]) -> None:
-    whole = WLR(window=3)(buffers).color
+@pytest.mark.parametrize("fused", [False, True])
+def test_memory_changes_nothing_but_memory(buffers: dict[str, Tensor], fused: bool) -> None:
+    whole = WLR(window=3, fused=fused)(buffers).color
     for memory in (100, 200_000, 1_000_000):  # single pixels, parts of rows, rows
-        torch.testing.assert_close(WLR(window=3, memory=memory)(buffers).color, whole, rtol=1e-10, atol=0)
+        found = WLR(window=3, memory=memory, fused=fused)(buffers).color
+        torch.testing.assert_close(found, whole, rtol=1e-10, atol=0)
 
 
-def test_a_fit_that_turns_negative_is_an_average() -> None:
+def test_compiled_kernels_give_the_same_for_every_number_of_rows_and_threads() -> None:
+    given = means(scene(7))
+    whole = WLR(window=2, map_sigma=2.0, fused=False).details(given)
+    for memory in (100, 400_000, None):
+        found = WLR(window=2, map_sigma=2.0, memory=memory, fused=True).details(given)
+        assert torch.equal(found.rank, whole.rank)
+        torch.testing.assert_close(found.bandwidth, whole.bandwidth, rtol=1e-9, atol=0)
+        torch.testing.assert_close(found.color, whole.color, rtol=1e-9, atol=1e-12)
+    torch.set_num_threads(2)
+    assert torch.equal(WLR(window=2, map_sigma=2.0, fused=True)(given).color, found.color)
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_fit_that_turns_negative_is_an_average(fused: bool) -> None:
     made = means(scene(5))
     cut = {name: x[..., :9, 3:14] for name, x in made.items()}
     cut["color"] = (cut["color"] - 0.45).clamp_min(0.0)
     expected = transcription(cut, 3)
-    found = WLR(window=3)(cut).color
+    found = WLR(window=3, fused=fused)(cut).color
     assert relative(found, expected.color) < 1e-9
     assert found.min() >= 0
-    linear = WLR(window=3)({**cut, "color": cut["color"] + 1.0}).color - 1.0
+    linear = WLR(window=3, fused=fused)({**cut, "color": cut["color"] + 1.0}).color - 1.0
     assert linear.min() < -0.01
 
 
+@pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize("names", [(), ("albedo",), ("depth", "roughness")])
-def test_any_features_can_be_named(names: tuple[str, ...]) -> None:
+def test_any_features_can_be_named(names: tuple[str, ...], fused: bool) -> None:
     whole = means(scene(3))
     rough = {f"roughness{part}": 0.1 * whole[f"depth{part}"] ** 2 for part in ("", "_variance")}
     cut = {n: x[..., :9, 5:15] for n, x in {**whole, **rough}.items()}
-    network = WLR(names, window=2)
+    network = WLR(names, window=2, fused=fused)
     assert network.inputs == tuple(f"{n}{part}" for n in ("color", *names) for part in ("", "_variance"))
     assert relative(network(cut).color, transcription(cut, 2, names).color) < 1e-9
 
@@ -143,9 +167,10 @@ def test_what_is_linear_in_position_and_features_is_kept_but_for_the_ridge() -> 
     assert (biased - given["color"]).abs().max() > 1e-3
 
 
-def test_constant_images_stay_constant_whatever_the_features() -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_constant_images_stay_constant_whatever_the_features(fused: bool) -> None:
     given = noiseless()
-    torch.testing.assert_close(WLR(window=3)(given).color, given["color"], rtol=1e-12, atol=0)
+    torch.testing.assert_close(WLR(window=3, fused=fused)(given).color, given["color"], rtol=1e-12, atol=0)
 
 
 def test_directions_that_noise_explains_are_cut_off() -> None:

@@ -110,28 +110,40 @@ def test_missing_buffers_are_named_with_what_makes_them(buffers: dict[str, Tenso
         WLR()(buffers)
 
 
-def test_damaged_pixels_do_not_spread_and_are_filled(buffers: dict[str, Tensor]) -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_damaged_pixels_do_not_spread_and_are_filled(buffers: dict[str, Tensor], fused: bool) -> None:
+    network = WLR(window=2, fused=fused)
     holes = {name: x.clone() for name, x in buffers.items()}
     holes["color"][..., 8, 8] = torch.nan
     holes["color"][:, 1, 3, 12] = torch.inf
     holes["color_variance"][..., 12, 3] = torch.nan
     holes["albedo"][..., 5, 5] = torch.nan
     damaged = [(8, 8), (3, 12), (12, 3), (5, 5)]
-    found = read(WLR(window=2), holes)
+    found = read(network, holes)
     assert found.isfinite().all()
     other = {name: x.clone() for name, x in holes.items()}
     for y, x in damaged:
         other["color"][..., y, x] = torch.nan
         other["color_variance"][..., y, x] = 7.0
-    torch.testing.assert_close(read(WLR(window=2), other), found, rtol=1e-6, atol=0)
+    torch.testing.assert_close(read(network, other), found, rtol=1e-6, atol=0)
     around = buffers["color"][..., 6:11, 6:11]
     assert (found[..., 8, 8] >= around.amin((-1, -2))).all()
     assert (found[..., 8, 8] <= around.amax((-1, -2))).all()
 
 
-def test_an_image_of_nothing_but_damage_is_black(buffers: dict[str, Tensor]) -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_an_image_of_nothing_but_damage_is_black(buffers: dict[str, Tensor], fused: bool) -> None:
     holes = {name: torch.full_like(x, torch.nan) for name, x in buffers.items()}
-    assert (read(WLR(window=2), holes) == 0).all()
+    assert (read(WLR(window=2, fused=fused), holes) == 0).all()
+
+
+def test_compiled_kernels_fill_damaged_pixels_like_the_others(buffers: dict[str, Tensor]) -> None:
+    buffers["color"][..., 8, 8] = torch.nan
+    buffers["color_variance"][..., 12, 3] = torch.nan
+    buffers["albedo"][..., 5, 5] = torch.inf
+    wide = {name: x.double() for name, x in buffers.items()}
+    found = read(WLR(window=2, fused=True), wide)
+    torch.testing.assert_close(found, read(WLR(window=2, fused=False), wide), rtol=1e-9, atol=1e-12)
 
 
 def test_a_variance_that_is_not_a_number_counts_as_the_limit(buffers: dict[str, Tensor]) -> None:

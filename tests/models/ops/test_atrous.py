@@ -160,3 +160,42 @@ def test_gradients_are_those_of_finite_differences() -> None:
     lit = torch.rand(1, 3, 4, 4, generator=generator, dtype=torch.float64, requires_grad=True)
     spread = torch.tensor(0.3, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda x: means(x, where, atrous_taps(1), spread), lit)
+
+
+def rough(height: int = 37, width: int = 300) -> tuple[Tensor, Tensor, Tensor]:
+    """Return normal, depth and light of boards before a sky, with noise on all of them, in float32."""
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand(1, 8, height, width, generator=generator)
+    depth = 4 + (torch.arange(width) // 40 % 3) + 0.02 * torch.arange(height)[:, None] + 0.01 * noise[:, :1]
+    normal = F.normalize(torch.tensor([0.1, 0.2, 1.0])[:, None, None] + 0.1 * noise[:, 1:4], dim=1)
+    depth[..., :5, 20:90] = 0
+    return normal, depth, noise[:, 4:7] * (1 + 50 * (noise[:, 7:] > 0.99))
+
+
+@pytest.mark.parametrize("slope", ["steepest", "along"])
+@pytest.mark.parametrize("taps", [box_taps(3), atrous_taps(1), atrous_taps(4)], ids=len)
+def test_compiled_kernels_average_like_the_others(slope: Any, taps: list[Tap]) -> None:
+    normal, depth, light = rough()
+    where = Surfaces(normal, depth, 8, EdgeStops(0.7, 64.0, slope))
+    spread = 0.1 + light[:, 1:2]
+    variances = torch.cat([light[:, :1].square(), light[:, 2:]], 1)
+    for kinds in (variances, variances[:, :0]):
+        found, expected = (
+            edge_stopping_means(light, kinds, spread, where, taps, fused=fused) for fused in (True, False)
+        )
+        torch.testing.assert_close(found.values, expected.values, rtol=2e-5, atol=1e-6)
+        torch.testing.assert_close(found.variances, expected.variances, rtol=4e-5, atol=1e-6)
+    assert (expected.values - light).abs().max() > 1
+
+
+def test_compiled_kernels_average_every_image_of_a_batch_by_itself() -> None:
+    normal, depth, light = (torch.cat([x, x.flip(-1)]) for x in rough(20, 40))
+    where, taps = Surfaces(normal, depth, 4, EdgeStops()), atrous_taps(2)
+    found = edge_stopping_means(light, light[:, :1], torch.tensor(1.0), where, taps, fused=True)
+    expected = edge_stopping_means(light, light[:, :1], torch.tensor(1.0), where, taps, fused=False)
+    torch.testing.assert_close(found.values, expected.values, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("exponent", "doublings"), [(128.0, 7), (1.0, 0), (0.5, None), (96.0, None)])
+def test_only_powers_of_two_are_made_of_squares(exponent: float, doublings: int | None) -> None:
+    assert surfaces(wall(), normal=exponent).doublings() == doublings

@@ -26,9 +26,15 @@ def test_a_cliff_is_no_slope_on_either_side() -> None:
 
 def test_the_smaller_of_both_sides_counts_with_its_sign() -> None:
     right, _ = slopes(row(0, 5, 3, 10))
-    assert right.flatten().tolist() == [5, -2, -2, 7]
+    assert right.flatten().tolist() == [-2, -2, -2, -2]
     _, down = slopes(row(0, 5, 3, 10).mT)
-    assert down.flatten().tolist() == [5, -2, -2, 7]
+    assert down.flatten().tolist() == [-2, -2, -2, -2]
+
+
+def test_a_cliff_beside_the_last_pixel_of_a_row_is_no_slope() -> None:
+    right, _ = slopes(row(100, 1, 2, 3, 50))
+    assert right.flatten().tolist() == [1, 1, 1, 1, 1]
+    assert slopes(row(1, 5))[0].flatten().tolist() == [4, 4]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (5, 1)])
