@@ -16,10 +16,8 @@ What is decided here, since it is not known:
 
 - Distances (position, depth) are relative to the largest of the frame, so that the least variance 1e-4 means
   the same in every scene; positions of training patches to the largest of the patch.
-- The 36 numbers are normalised by mean and standard deviation of the first batch of a training, over all of
-  its processes, measured before the first step and stored with the weights; what does not vary in it, as
-  1 / samples per pixel, is only shifted. Without training they stay as they are.
-- The last layer starts with small weights around a broad filter; the authors' start is not known.
+- The 36 numbers are normalised by mean and standard deviation of the first batch of a training, and the last
+  layer starts with small weights around a broad filter (`models.blocks.pixel_parameters`).
 - `exposure` multiplies the colour first, since the small constant of its distance has the units of a
   variance.
 
@@ -33,14 +31,14 @@ that. 436 parameters.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from data.buffers import SECOND_ALBEDO, SECOND_HIT_MADE, buffer
+from models.blocks.pixel_parameters import PixelParameters
 from models.classical.nlm import Sampling
 from models.denoiser import Buffers, Denoised, Denoiser
 from models.ops import halves, secondary_features
@@ -110,9 +108,6 @@ class LBF(Denoiser):
 
     frame_numbers: tuple[str, ...] = ("exposure", "depth_range")
     no_export = UNROLLED
-    feature_mean: Tensor
-    feature_deviation: Tensor
-    measured: Tensor
 
     def __init__(
         self,
@@ -151,7 +146,8 @@ class LBF(Denoiser):
         self.spike_window = spike_window
         self.rule = BilateralRule(tuple(buffer(n).channels for n in self.features), window, color_factor)
         self._prefilter = GroupKernel(prefilter_window, prefilter_patch, prefilter_smoothing)
-        self._build(hidden)
+        starts = (_START[0], *[_START[1]] * len(self.features))
+        self.network = PixelParameters(secondary_features.NUMBERS * len(self.features) + 1, hidden, starts)
         self.halo = self._reach()
         # Measured: growth of resident memory from 384x384 to 640x640, 0 and 13 channels of features; strips
         # take up to `memory` beside that.
@@ -176,20 +172,6 @@ class LBF(Denoiser):
         for name in ("variance_spikes", "output_spikes"):
             if given[name] is not None and not given[name] > 0:
                 raise ValueError(f"LBF: {name} must be above 0, or none, got {given[name]}")
-
-    def _build(self, hidden: int) -> None:
-        """Make the network and what its input is normalised by."""
-        seen, made = secondary_features.NUMBERS * len(self.features) + 1, self.rule.distances
-        self.first = nn.Conv2d(seen, hidden, 1)
-        self.last = nn.Conv2d(hidden, made, 1)
-        assert self.last.bias is not None
-        with torch.no_grad():
-            self.last.weight.mul_(0.1)
-            starts = [_START[0], *[_START[1]] * len(self.features)]
-            self.last.bias.copy_(torch.tensor([math.log(math.expm1(start)) for start in starts]))
-        self.register_buffer("feature_mean", torch.zeros(seen))
-        self.register_buffer("feature_deviation", torch.ones(seen))
-        self.register_buffer("measured", torch.zeros((), dtype=torch.bool))
 
     def _reach(self) -> int:
         """Return how far a pixel looks on each side."""
@@ -247,7 +229,7 @@ class LBF(Denoiser):
             if self.variance_spikes is not None:
                 color = self._calm(color, self.variance_spikes)
             features = self._features(buffers, color.image)
-            scales = self._scales(features.statistics)
+            scales = self.network(features.statistics)
             filtered = scaled_bilateral(self._pixels(color, features), scales, self.rule, self.memory)
             if self.output_spikes is not None:
                 filtered = without_spikes(filtered, 1, self.output_spikes)
@@ -290,28 +272,6 @@ class LBF(Denoiser):
         images = torch.cat([none, *(guide.image for guide in features.groups.values())], 1)
         variances = torch.cat([none, *(guide.variance for guide in features.groups.values())], 1)
         return Pixels(color.image, color.variance, images, variances.clamp_min(self.least_variance))
-
-    def _scales(self, statistics: Tensor) -> Tensor:
-        """Return how much each distance counts, (B, 1 + groups, H, W), positive."""
-        if self.training and torch.is_grad_enabled() and not self.measured:
-            self._normalise_by(statistics.detach())
-        mean, deviation = (x[:, None, None] for x in (self.feature_mean, self.feature_deviation))
-        hidden = torch.sigmoid(self.first((statistics - mean) / (deviation + 1e-6)))
-        return torch.log1p(torch.exp(self.last(hidden).clamp_max(10.0)))
-
-    def _normalise_by(self, statistics: Tensor) -> None:
-        """Measure mean and standard deviation of a batch, over all processes of a training."""
-        each = statistics.double().transpose(0, 1).flatten(1)
-        sums = torch.stack([torch.ones_like(each).sum(1), each.sum(1), each.square().sum(1)])
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.all_reduce(sums)
-        count, total, square = sums
-        mean = total / count
-        deviation = (square / count - mean.square()).clamp_min(0.0).sqrt()
-        varies = deviation > 1e-6 * mean.abs().clamp_min(1e-6)
-        self.feature_mean.copy_(mean)
-        self.feature_deviation.copy_(torch.where(varies, deviation, 1.0))
-        self.measured.fill_(True)
 
     def _layers(self, buffers: Buffers, scales: Tensor, features: Features) -> dict[str, Tensor]:
         names = ("image", *self.features)

@@ -55,7 +55,7 @@ def filtered_by() -> tuple[Pixels, Tensor, BilateralRule]:
         buffers = mosaic(SIDE, SIDE, method.inputs)
         color = method._noisy(buffers, "color")
         features = method._features(buffers, color.image)
-        return method._pixels(color, features), method._scales(features.statistics), method.rule
+        return method._pixels(color, features), method.network(features.statistics), method.rule
 
 
 def _times(pixels: Pixels, scales: Tensor, rule: BilateralRule) -> list[Row]:

@@ -50,19 +50,19 @@ def random_network(method: LBF, seed: int = 3) -> plain_lbf.Network:
     def noise(*size: int) -> Tensor:
         return torch.randn(*size, generator=generator, dtype=torch.float64)
 
-    hidden, seen = method.first.weight.shape[:2]
-    method.first.weight.data.copy_(0.7 * noise(hidden, seen, 1, 1))
-    method.last.weight.data.copy_(1.5 * noise(*method.last.weight.shape))
-    assert method.last.bias is not None
-    method.last.bias.data.copy_(torch.linspace(-4, 1, len(method.last.bias)))
-    method.feature_mean.copy_(0.3 * noise(seen))
-    method.feature_deviation.copy_(0.3 + noise(seen).abs())
+    hidden, seen = method.network.first.weight.shape[:2]
+    method.network.first.weight.data.copy_(0.7 * noise(hidden, seen, 1, 1))
+    method.network.last.weight.data.copy_(1.5 * noise(*method.network.last.weight.shape))
+    assert method.network.last.bias is not None
+    method.network.last.bias.data.copy_(torch.linspace(-4, 1, len(method.network.last.bias)))
+    method.network.mean.copy_(0.3 * noise(seen))
+    method.network.deviation.copy_(0.3 + noise(seen).abs())
     layers = [
         (layer.weight.detach()[..., 0, 0].double().numpy(), layer.bias.detach().double().numpy())
-        for layer in (method.first, method.last)
+        for layer in (method.network.first, method.network.last)
         if layer.bias is not None
     ]
-    mean, deviation = method.feature_mean.double().numpy(), method.feature_deviation.double().numpy()
+    mean, deviation = method.network.mean.double().numpy(), method.network.deviation.double().numpy()
     return plain_lbf.Network(layers[0], layers[1], mean, deviation)
 
 
@@ -135,8 +135,8 @@ def test_the_papers_groups_make_36_features_and_436_parameters() -> None:
     method = LBF()
     assert method.features == ("position", "normal", "albedo", "second_albedo", "visibility")
     assert NUMBERS * len(method.features) + 1 == 36
-    assert method.first.weight.shape[:2] == (10, 36)
-    assert method.last.weight.shape[:2] == (6, 10)
+    assert method.network.first.weight.shape[:2] == (10, 36)
+    assert method.network.last.weight.shape[:2] == (6, 10)
     assert sum(parameter.numel() for parameter in method.parameters()) == 436
     assert method.rule.groups == (3, 3, 3, 3, 1)
     assert method.rule.window == 27
@@ -177,57 +177,6 @@ def test_it_learns_through_the_filter() -> None:
     assert losses[-1] < 0.1 * noisy
 
 
-def test_the_first_batch_of_a_training_sets_the_normalisation_and_no_other_does() -> None:
-    method, batch = LBF(("albedo",), **SMALL), select(LBF(("albedo",)), training_batch())
-    method.eval()
-    method(batch)
-    assert not method.measured
-    assert torch.equal(method.feature_mean, torch.zeros(8))
-    method.train()
-    method(batch)
-    assert method.measured
-    seen = method._features(batch, 0.5 * (batch["color_a"] + batch["color_b"])).statistics
-    normal = (seen - method.feature_mean[:, None, None]) / (method.feature_deviation[:, None, None] + 1e-6)
-    assert normal.mean((0, 2, 3)).abs().max() < 1e-3
-    torch.testing.assert_close(normal[:, :7].std((0, 2, 3)), torch.ones(7), rtol=1e-2, atol=0)
-    assert method.feature_deviation[7] == 1.0  # 1 / samples per pixel does not vary
-    before = method.state_dict()["feature_mean"].clone()
-    method({name: 2 * image for name, image in batch.items()})
-    assert torch.equal(method.feature_mean, before)
-
-
-def test_all_processes_of_a_training_normalise_by_what_all_of_them_see(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    whole = select(LBF(("albedo",)), training_batch())
-    alone = LBF(("albedo",), **SMALL)
-    alone(whole)
-    sums: list[Tensor] = []
-
-    def reduce(mine: Tensor) -> None:
-        """Keep what the first process sends, and add it to what the second does."""
-        sums.append(mine.clone())
-        mine.copy_(torch.stack(sums).sum(0))
-
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "all_reduce", reduce)
-    for half in (slice(0, 1), slice(1, 2)):
-        method = LBF(("albedo",), **SMALL)
-        method({name: image[half] for name, image in whole.items()})
-    assert len(sums) == 2
-    torch.testing.assert_close(method.feature_mean, alone.feature_mean)
-    torch.testing.assert_close(method.feature_deviation, alone.feature_deviation)
-
-
-def test_a_resumed_training_keeps_its_normalisation() -> None:
-    method, batch = LBF(("albedo",), **SMALL), select(LBF(("albedo",)), training_batch())
-    method(batch)
-    other = LBF(("albedo",), **SMALL)
-    other.load_state_dict(method.state_dict())
-    other({name: 2 * image for name, image in batch.items()})
-    assert torch.equal(other.feature_deviation, method.feature_deviation)
-
-
 def test_what_is_missing_and_what_makes_it_is_named() -> None:
     given = noisy_buffers(1, 16, 16)
     del given["albedo_variance"]
@@ -255,7 +204,7 @@ def test_halves_or_a_mean_and_a_variance_do_where_the_others_are_missing() -> No
     given = noisy_buffers(1, 16, 18)
     color = other({name: given[name] for name in available}).color
     assert color.isfinite().all()
-    assert torch.equal(dict(other.named_parameters())["first.weight"], method.first.weight)
+    assert torch.equal(dict(other.named_parameters())["network.first.weight"], method.network.first.weight)
     assert method.instead({"color", "albedo"}) is None
 
 

@@ -1,10 +1,11 @@
-"""The hot loops of non-local means, NFOR, WLR and SVGF, fused into compiled kernels for the CPU (Numba).
+"""The hot loops of non-local means, NFOR, WLR, LBF and SVGF, fused into compiled kernels for the CPU (Numba).
 
 The same formulas as `models.ops.nlm`, `models.ops.regression`, `models.ops.histogram_distance`,
-`models.ops.local_regression` and `models.ops.atrous`, which are the reference and run where Numba is not
-installed (optional extra `fast`) or cannot work. Here a tile of pixels stays in the cache through all steps:
-distances, box sums, exponential, sums of products, factorisation, prediction. Strips of rows run on as many
-threads as PyTorch may use; each adds into images of its own, which are joined in order.
+`models.ops.local_regression`, `models.ops.scaled_bilateral` and `models.ops.atrous`, which are the reference
+and run where Numba is not installed (optional extra `fast`) or cannot work. Here a tile of pixels stays in
+the cache through all steps: distances, box sums, exponential, sums of products, factorisation, prediction.
+Strips of rows run on as many threads as PyTorch may use; each adds into images of its own, which are joined
+in order.
 
 Weights below 3e-20 are taken as 0; `weights.py` says why.
 
