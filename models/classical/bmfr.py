@@ -29,7 +29,7 @@ from torch import Tensor
 
 from models.classical.sequence_filter import SequenceFilter, carried, checked, follows
 from models.denoiser import Buffers, Denoised
-from models.ops.block_regression import BlockRegression, Scale, Solver
+from models.ops.block_regression import STEP, BlockRegression, Scale, Solver
 from models.ops.guides import finite
 from models.ops.reproject import Neighbours, bilinear, position_limit
 from models.ops.tonemap import LARGEST
@@ -52,6 +52,8 @@ class BMFR(SequenceFilter):
         position_limit_squared: Squared distance within which points are one surface's, in squared scene
             units; None: 6 pixels' footprints, see `models.ops.reproject.footprint`.
         normal_limit_squared: Squared difference within which normals are one surface's, 0 to 4.
+        block: Side of the blocks, in pixels, a multiple of 16. The paper's 32 at 1280x720 shows four times as
+            much of the scene in each direction at 320x180.
         noise: Largest noise that regularises the regression.
         scale: Which ranges of positions are brought to [0, 1] within a block: `large`, above 1 scene unit
             (code), or `all`, which does not depend on the scene's unit.
@@ -78,6 +80,7 @@ class BMFR(SequenceFilter):
         longest: int = 255,
         position_limit_squared: float | None = None,
         normal_limit_squared: float = NORMAL_LIMIT_SQUARED,
+        block: int = 32,
         noise: float = 0.01,
         scale: Scale = "large",
         half: bool = False,
@@ -94,10 +97,12 @@ class BMFR(SequenceFilter):
         for name, value, words in (("scale", scale, get_args(Scale)), ("solver", solver, get_args(Solver))):
             if value not in words:
                 raise ValueError(f"BMFR: {name} must be {' or '.join(words)}, got {value!r}")
+        if block < STEP or block % STEP:
+            raise ValueError(f"BMFR: block must be a multiple of {STEP}, got {block}")
         self.noisy_alpha, self.filtered_alpha, self.longest = noisy_alpha, filtered_alpha, longest
         self.position_limit_squared = position_limit_squared
         self.normal_limit_squared = normal_limit_squared
-        self.regression = BlockRegression(noise, scale, half, solver)
+        self.regression = BlockRegression(noise, scale, half, solver, block)
         self.taa_new, self.cut, self.aux = (taa_new if taa else None), cut, aux
 
     def forward(self, buffers: Buffers, state: Mapping[str, Tensor] | None = None) -> Denoised:

@@ -67,7 +67,6 @@ Geometry = Literal["depth", "position"]
 RELATIVE_FLOOR = 0.001
 """Difference of depth, relative to the depth, that counts as no variation yet."""
 
-_YOUNG_RADIUS = 3
 _LEAST_VARIANCE = 1e-10
 
 
@@ -95,7 +94,8 @@ class SVGF(SequenceFilter):
         sigma_n: Exponent of the cosine between normals.
         sigma_l: How far luminances may differ, in standard deviations.
         slope: `steepest` or `along`, see `models.ops.atrous`.
-        young: Pixels with fewer frames take their variance from 7x7 neighbours.
+        young: Pixels with fewer frames take their variance from their neighbours.
+        young_radius: Of the window of these neighbours.
         prefilter: These pixels also become the mean of their neighbours.
         geometry: What is compared with the frame before: `depth`, or `position`, which stays as it is when
             the camera moves forwards and which then is read as well.
@@ -133,6 +133,7 @@ class SVGF(SequenceFilter):
         sigma_l: float = 4.0,
         slope: Slope = "steepest",
         young: int = 4,
+        young_radius: int = 3,
         prefilter: bool = True,
         geometry: Geometry = "depth",
         depth_limit: float = 10.0,
@@ -151,7 +152,8 @@ class SVGF(SequenceFilter):
         super().__init__()
         self._arguments = arguments
         _check(arguments)
-        self.iterations, self.feedback, self.longest, self.young = iterations, feedback, longest, young
+        self.iterations, self.feedback, self.longest = iterations, feedback, longest
+        self.young, self.young_radius = young, young_radius
         self.alphas = (alpha, moments_alpha)
         self.stops, self.sigma_l = EdgeStops(sigma_z, sigma_n, slope), sigma_l
         self.prefilter, self.geometry, self.margin, self.aux = prefilter, geometry, margin, aux
@@ -203,7 +205,7 @@ class SVGF(SequenceFilter):
         return other, ("no position: depths are compared, which a camera that moves forwards changes",)
 
     def _reach(self) -> int:
-        return max(_YOUNG_RADIUS, 2 ** max(self.iterations, 1))
+        return max(self.young_radius, 2 ** max(self.iterations, 1))
 
     def _seen(self, buffers: Buffers) -> State:
         """Return what pixels show: unit normals, depth, and positions where they are read."""
@@ -261,7 +263,7 @@ class SVGF(SequenceFilter):
         young = now.frames < self.young - 1e-3  # a mean's rounding makes no pixel young
         if not exporting() and not bool(young.any()):
             return now.color, variance
-        joined, taps = torch.cat([now.color, now.moments], 1), box_taps(_YOUNG_RADIUS)
+        joined, taps = torch.cat([now.color, now.moments], 1), box_taps(self.young_radius)
         spread = now.frames.new_tensor(self.sigma_l)
         around = edge_stopping_means(joined, joined[:, :0], spread, surfaces, taps, fused=self.fused).values
         guessed = _variance(around[:, 3:]) * (self.young / now.frames)
@@ -288,7 +290,7 @@ def _check(given: Mapping[str, Any]) -> None:
     positive = ("longest", "sigma_z", "sigma_n", "sigma_l", "depth_limit", "normal_limit", "least_share")
     shares = ("alpha", "moments_alpha", "taa_new")
     checked("SVGF", given, positive=(*positive, "position_limit_squared"), shares=shares)
-    for name in ("iterations", "margin", "young", "depth_floor", "normal_floor"):
+    for name in ("iterations", "margin", "young", "young_radius", "depth_floor", "normal_floor"):
         if given[name] is not None and not given[name] >= 0:
             raise ValueError(f"SVGF: {name} must be at least 0, got {given[name]}")
     if not 0 <= given["feedback"] <= given["iterations"]:

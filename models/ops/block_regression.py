@@ -1,8 +1,8 @@
 """Least squares in blocks of pixels with stochastic regularisation, as BMFR fits noisy light to features.
 
-The image is cut into blocks of 32x32 pixels whose grid moves from frame to frame; pixels beyond the border
-are mirrored ones. In each block the three channels of the light are fitted by a linear combination of ten
-features T of the pixels,
+The image is cut into blocks of 32x32 pixels, or another side, whose grid moves from frame to frame; pixels
+beyond the border are mirrored ones. In each block the three channels of the light are fitted by a linear
+combination of ten features T of the pixels,
 
     1, normal, position, position^2 (each of x, y, z),
 
@@ -36,16 +36,16 @@ all."""
 Solver = Literal["normal", "qr"]
 """How equations are solved: by normal equations and a Cholesky factorisation, or by a QR factorisation."""
 
-SIDE = 32
-"""Of a block, in pixels."""
-
 FEATURES = 10
 
 OFFSETS = (
     (-14, -14), (4, -6), (-8, 14), (8, 0), (-10, -8), (2, 12), (12, -12), (-10, 0),
     (12, 14), (-8, -16), (6, 6), (-2, -2), (6, -14), (-16, 12), (14, -4), (-6, 4),
 )  # fmt: skip
-"""Where the grid of successive frames lies, x and y in pixels from (-16, -16)."""
+"""Where the grid of successive frames lies, x and y from half a block above and left, in 32nds of a block."""
+
+STEP = 16
+"""Sides of blocks are multiples of it: then the grids of all frames begin at whole pixels."""
 
 _HALF = 65504.0
 
@@ -59,12 +59,14 @@ class BlockRegression:
         scale: See the module.
         half: Round block data to half precision, as the released code does.
         solver: See `Solver`.
+        side: Of a block, in pixels, a multiple of 16.
     """
 
     noise: float = 0.01
     scale: Scale = "large"
     half: bool = False
     solver: Solver = "normal"
+    side: int = 32
 
     def __call__(self, light: Tensor, normal: Tensor, position: Tensor, frame: Tensor) -> Tensor:
         """Return fitted light (B, 3, H, W), which may be negative.
@@ -80,20 +82,21 @@ class BlockRegression:
 
     def _fit(self, light: Tensor, normal: Tensor, position: Tensor, frame: Tensor) -> Tensor:
         height, width = light.shape[-2:]
-        offset = torch.tensor(OFFSETS, device=light.device)[frame % len(OFFSETS)] - SIDE // 2
-        noise = self.noise * noise_of(frame).to(light.dtype)
-        rows, columns = (_places(offset[:, axis], size) for axis, size in ((1, height), (0, width)))
+        offsets = torch.tensor(OFFSETS, device=light.device) * self.side // 32 - self.side // 2
+        first = offsets[frame % len(OFFSETS)]
+        noise = self.noise * noise_of(frame, self.side).to(light.dtype)
+        rows, columns = (_places(first[:, axis], size, self.side) for axis, size in ((1, height), (0, width)))
         data = torch.cat([light, normal, position], 1)
         fitted = []
         # A row of blocks at a time: their equations, in float64, stay near the processor.
-        for part in rows.unflatten(1, (-1, SIDE)).unbind(1):
-            blocks = _cut(data, mirrored(part, height), mirrored(columns, width))
-            fitted.append(_joined(self._fitted(blocks, noise), columns.shape[1]))
+        for part in rows.unflatten(1, (-1, self.side)).unbind(1):
+            blocks = _cut(data, mirrored(part, height), mirrored(columns, width), self.side)
+            fitted.append(_joined(self._fitted(blocks, noise), self.side))
         whole = torch.cat(fitted, 1)
         return _cut_back(whole, rows[:, 0], columns[:, 0], (height, width))
 
     def _fitted(self, blocks: Tensor, noise: Tensor) -> Tensor:
-        """Return fitted light (B, N, 1024, 3) of blocks (B, N, 1024, 9)."""
+        """Return fitted light (B, N, side^2, 3) of blocks (B, N, side^2, 9)."""
         light, features = blocks[..., :3], self._features(blocks)
         if self.half:
             light, features = ((x.clamp(-_HALF, _HALF).half().to(x.dtype)) for x in (light, features))
@@ -124,17 +127,18 @@ def solve(features: Tensor, light: Tensor, solver: Solver) -> Tensor:
     return torch.cholesky_solve(wide.mT @ light.double(), factor).to(light.dtype)
 
 
-def noise_of(frame: Tensor) -> Tensor:
-    """Return noise in [-1, 1] for all features but the constant, (B, 1024, 9), float64.
+def noise_of(frame: Tensor, side: int = 32) -> Tensor:
+    """Return noise in [-1, 1] for all features but the constant, (B, side^2, 9), float64.
 
-    The hash of pixel in block + 1024 (feature + 10 frame), divided by its largest value.
+    The hash of pixel in block + side^2 (feature + 10 frame), divided by its largest value.
 
     Args:
         frame: Number of each frame (B,).
+        side: Of a block.
     """
-    pixels = torch.arange(SIDE * SIDE, device=frame.device)[:, None]
+    pixels = torch.arange(side * side, device=frame.device)[:, None]
     features = torch.arange(1, FEATURES, device=frame.device)
-    key = pixels + SIDE * SIDE * (features + FEATURES * frame.long()[:, None, None])
+    key = pixels + side * side * (features + FEATURES * frame.long()[:, None, None])
     return 2.0 * hashed(key).double() / 0xFFFFFFFF - 1.0
 
 
@@ -158,22 +162,23 @@ def _multiplied(key: Tensor, factor: int) -> Tensor:
     return (low * factor + ((high * factor & 0xFFFF) << 16)) & 0xFFFFFFFF
 
 
-def _places(first: Tensor, size: int) -> Tensor:
-    """Return the rows or columns (B, 32 n) of all blocks along an axis, of which the first begins there."""
-    count = -(-size // SIDE) + 1
-    return first[:, None] + torch.arange(count * SIDE, device=first.device)
+def _places(first: Tensor, size: int, side: int) -> Tensor:
+    """Return the rows or columns (B, side n) of all blocks along an axis, of which the first begins there."""
+    count = -(-size // side) + 1
+    return first[:, None] + torch.arange(count * side, device=first.device)
 
 
-def _cut(data: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """Return blocks (B, N, 1024, C) of images (B, C, H, W) at rows (B, 32) and columns (B, 32 N)."""
+def _cut(data: Tensor, rows: Tensor, columns: Tensor, side: int) -> Tensor:
+    """Return blocks (B, N, side^2, C) of images (B, C, H, W) at rows (B, side) and columns (B, side N)."""
     image = torch.arange(len(data), device=data.device)[:, None, None]
     strip = data.permute(0, 2, 3, 1)[image, rows[:, :, None], columns[:, None, :]]
-    return strip.unflatten(2, (-1, SIDE)).transpose(1, 2).flatten(2, 3)
+    return strip.unflatten(2, (-1, side)).transpose(1, 2).flatten(2, 3)
 
 
-def _joined(blocks: Tensor, width: int) -> Tensor:
-    """Return a strip (B, 32, W, C) of blocks (B, N, 1024, C): the inverse of `_cut`."""
-    return blocks.unflatten(2, (SIDE, SIDE)).transpose(1, 2).reshape(len(blocks), SIDE, width, -1)
+def _joined(blocks: Tensor, side: int) -> Tensor:
+    """Return a strip (B, side, side N, C) of blocks (B, N, side^2, C): the inverse of `_cut`."""
+    rows = blocks.unflatten(2, (side, side)).transpose(1, 2)
+    return rows.flatten(2, 3)
 
 
 def _cut_back(whole: Tensor, top: Tensor, left: Tensor, size: tuple[int, int]) -> Tensor:

@@ -27,6 +27,7 @@ class Options:
     half: bool = False
     taa: bool = True
     cut: bool = False
+    side: int = 32
 
 
 def accepted(now: Frame, past: Frame, p: tuple[int, int], o: Options) -> list[tuple[float, tuple[int, int]]]:
@@ -55,9 +56,9 @@ def mirror(i: int, size: int) -> int:
     return i
 
 
-def uniform(pixel: int, feature: int, frame: int) -> float:
+def uniform(pixel: int, feature: int, frame: int, side: int = 32) -> float:
     """Return a number in [-1, 1] that a hash of 32 bits decides."""
-    h = (pixel + 1024 * (feature + 10 * frame)) % 2**32
+    h = (pixel + side**2 * (feature + 10 * frame)) % 2**32
     h ^= h >> 16
     h = h * 0x85EBCA6B % 2**32
     h ^= h >> 13
@@ -67,11 +68,11 @@ def uniform(pixel: int, feature: int, frame: int) -> float:
 
 
 def block_matrix(now: Frame, noisy: Array, top: int, left: int, o: Options) -> tuple[Array, Array]:
-    """Return features (1024, 10) and light (1024, 3) of a block."""
+    """Return features (side^2, 10) and light (side^2, 3) of a block."""
     height, width = noisy.shape[:2]
     features, light = [], []
-    for i in range(1024):
-        q = (mirror(top + i // 32, height), mirror(left + i % 32, width))
+    for i in range(o.side**2):
+        q = (mirror(top + i // o.side, height), mirror(left + i % o.side, width))
         world = now["position"][q]
         features.append([1.0, *now["normal"][q], *world, *(world * world)])
         light.append(noisy[q])
@@ -89,17 +90,18 @@ def block_matrix(now: Frame, noisy: Array, top: int, left: int, o: Options) -> t
 
 def regression(now: Frame, noisy: Array, number: int, o: Options) -> Array:
     height, width = noisy.shape[:2]
-    right, down = OFFSETS[number % 16]
-    noise = np.array([[uniform(i, f, number) if f else 0.0 for f in range(10)] for i in range(1024)])
+    right, down = (int(offset * o.side / 32) for offset in OFFSETS[number % 16])
+    pixels = range(o.side**2)
+    noise = np.array([[uniform(i, f, number, o.side) if f else 0.0 for f in range(10)] for i in pixels])
     result = np.full_like(noisy, np.nan)
-    for top in range(down - 16, height, 32):
-        for left in range(right - 16, width, 32):
+    for top in range(down - o.side // 2, height, o.side):
+        for left in range(right - o.side // 2, width, o.side):
             matrix, colors = block_matrix(now, noisy, top, left, o)
             upper = np.linalg.qr(np.hstack([matrix + o.noise * noise, colors]), mode="r")
             weights = np.linalg.solve(upper[:10, :10], upper[:10, 10:])
             fitted = matrix @ weights
-            for i in range(1024):
-                q = (top + i // 32, left + i % 32)
+            for i in pixels:
+                q = (top + i // o.side, left + i % o.side)
                 if inside(noisy, q):
                     result[q] = np.maximum(fitted[i], 0)
     return result

@@ -26,6 +26,7 @@ class Options:
     sigma_l: float = 4.0
     along: bool = False
     prefilter: bool = True
+    young_radius: int = 3
     position_limit_squared: float | None = None
     depth_floor: float | None = None
     margin: int = 0
@@ -141,14 +142,15 @@ def edge_weight(now: Frame, p: tuple[int, int], q: tuple[int, int], o: Options) 
 
 
 def young_pixels(now: Frame, color: Array, moments: Array, count: Array, o: Options) -> tuple[Array, Array]:
-    """Return colour and variance, for pixels with less than 4 frames from 7x7 neighbours."""
+    """Return colour and variance, for pixels with less than 4 frames from neighbours around."""
     result, variance = color.copy(), np.maximum(moments[..., 1] - moments[..., 0] ** 2, 0)
+    reach = range(-o.young_radius, o.young_radius + 1)
     for p in np.ndindex(*color.shape[:2]):
         if count[p][0] >= 4:
             continue
         total, mean, mean_moments = 0.0, np.zeros(3), np.zeros(2)
-        for down in range(-3, 4):
-            for right in range(-3, 4):
+        for down in reach:
+            for right in reach:
                 q = (p[0] + down, p[1] + right)
                 if not inside(color, q):
                     continue

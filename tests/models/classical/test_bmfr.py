@@ -27,6 +27,8 @@ OPTIONS: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"noise": 0.05, "half": True, "taa": False}, {"noise": 0.05, "half": True, "taa": False}),
     ({"scale": "all", "cut": True}, {"always_scale": True, "cut": True}),
     ({"normal_limit_squared": 0.01, "solver": "qr"}, {"normal_limit_squared": 0.01}),
+    ({"block": 16}, {"side": 16}),
+    ({"block": 48}, {"side": 48}),
 ]
 
 
@@ -157,6 +159,7 @@ def test_with_all_ranges_scaled_positions_in_other_units_change_nothing() -> Non
         ({"position_limit_squared": 0.0}, "position_limit_squared must be above 0"),
         ({"normal_limit_squared": -1.0}, "normal_limit_squared must be above 0"),
         ({"scale": "none"}, "scale must be large or all"),
+        ({"block": 24}, "block must be a multiple of 16, got 24"),
         ({"solver": "lu"}, "solver must be normal or qr"),
     ],
     ids=str,

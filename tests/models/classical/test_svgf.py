@@ -24,6 +24,7 @@ OPTIONS: list[tuple[dict[str, Any], Options]] = [
     ({"iterations": 1, "feedback": 0, "slope": "along"}, Options(iterations=1, feedback=0, along=True)),
     ({"iterations": 2, "prefilter": False, "sigma_l": 10.0}, Options(2, prefilter=False, sigma_l=10.0)),
     ({"iterations": 1, "margin": 1, "taa": False}, Options(iterations=1, margin=1, taa=False)),
+    ({"iterations": 1, "young_radius": 1}, Options(iterations=1, young_radius=1)),
     (
         {"iterations": 1, "depth_floor": 0.2, "moments_alpha": 0.5},
         Options(1, depth_floor=0.2, moments_alpha=0.5),
