@@ -96,7 +96,7 @@ def fit(training: Training, identity: str, tags: Mapping[str, str], logs: Path, 
     environment[TRAINING_VARIABLE] = launch.identity
     log = logs / f"{folder_of(training.variant.name)}.txt"
     logs.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as kept:
+    with log.open("a") as kept, _passing_on() as hand_to:
         process = subprocess.Popen(
             [*COMMAND, *training.command(tags)],
             stdin=subprocess.DEVNULL,
@@ -107,8 +107,8 @@ def fit(training: Training, identity: str, tags: Mapping[str, str], logs: Path, 
             env=environment,
             start_new_session=True,  # Ctrl-C is for this process, which passes it on once
         )
-        with _passing_on(process):
-            last = _heard(process, kept, say)
+        hand_to(process)
+        last = _heard(process, kept, say)
     seconds = time.monotonic() - start
     run = _finished(training, identity)
     if run is not None:
@@ -147,29 +147,38 @@ def _reason(code: int, last: Sequence[str]) -> str:
 
 
 @contextmanager
-def _passing_on(process: subprocess.Popen[str]) -> Iterator[None]:
+def _passing_on() -> Iterator[Callable[[subprocess.Popen[str]], None]]:
     """Hand Ctrl-C and SIGTERM on to a process, once, and be interrupted when it has ended.
+
+    Yields what must be told the process. It is started within this context: one that is started where Ctrl-C
+    is ignored, as in the background of a script, would ignore it for ever.
 
     Raises:
         KeyboardInterrupt: One of both came.
     """
-    asked = False
+    asked, process = False, None
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
-        if asked:
+        if process is not None and asked:
             process.kill()
-        elif process.poll() is None:
+        elif process is not None and process.poll() is None:
             process.send_signal(signal.SIGINT)
         asked = True
 
+    def hand_to(started: subprocess.Popen[str]) -> None:
+        nonlocal process
+        if asked:
+            started.terminate()
+        process = started
+
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield hand_to
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if process.poll() is None:
+        if process is not None and process.poll() is None:
             process.kill()
             process.wait()
     if asked:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,8 +95,19 @@ def test_a_training_that_ends_well_without_a_finished_run_has_failed(monkeypatch
     assert run("good")[0]["good"] == "it left no finished run: nothing to do (logs/good.txt)"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interruption_is_handed_on_and_the_training_goes_on_later(number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    ("number", "of_ctrl_c"),
+    [
+        (signal.SIGINT, signal.default_int_handler),
+        (signal.SIGTERM, signal.default_int_handler),
+        (signal.SIGTERM, signal.SIG_IGN),  # in the background of a script
+    ],
+)
+def test_an_interruption_is_handed_on_and_the_training_goes_on_later(
+    number: signal.Signals, of_ctrl_c: Any, request: pytest.FixtureRequest
+) -> None:
+    was = signal.signal(signal.SIGINT, of_ctrl_c)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, was))
     signaller = subprocess.Popen(
         [
             sys.executable,
