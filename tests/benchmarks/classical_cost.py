@@ -6,7 +6,8 @@ small frame that loads its code. Times are wall times, the least of up to three 
 takes longer than `LONG` seconds. Growth is the quotient of the times of both frames; the frames' is 4. Memory
 is what the process takes at most beside the package and the frame, result included. Steps are shares of
 processor time, measured by a clock around the functions that make them; a step does not contain others. SVGF
-and BMFR filter the later of some frames of a camera that moves (`tests.benchmarks.sequence_frames`).
+and BMFR filter the later of some frames of a camera that moves (`tests.benchmarks.sequence_frames`); LBF has
+random weights.
 
 What their sharing and their compiled kernels save is in `tests.benchmarks.classical_plain`.
 
@@ -119,6 +120,16 @@ METHODS: dict[str, Method] = {
     ),
     "WLR": Method("WLR", {"features": FEATURES}, _WLR),
     "WLR-PF": Method("WLR", {"features": FEATURES, "prefilter": True}, {**_PREFILTER, **_WLR}),
+    "LBF": Method(
+        "LBF",
+        {"features": FEATURES},
+        {
+            "models.lbf.group_nlm": "features",
+            "models.ops.secondary_features.secondary_features": "statistics",
+            "models.lbf.scaled_bilateral": "filter",
+            "models.lbf.without_spikes": "spikes",
+        },
+    ),
     "SVGF": Method(
         "SVGF",
         steps={
