@@ -173,9 +173,12 @@ def _passing_on() -> Iterator[Callable[[subprocess.Popen[str]], None]]:
         process = started
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    # Where a library has blocked them, the process would have them blocked too.
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, before)
     try:
         yield hand_to
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for number, handler in before.items():
             signal.signal(number, handler)
         if process is not None and process.poll() is None:

@@ -96,18 +96,22 @@ def test_a_training_that_ends_well_without_a_finished_run_has_failed(monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("number", "of_ctrl_c"),
+    ("number", "of_ctrl_c", "blocked"),
     [
-        (signal.SIGINT, signal.default_int_handler),
-        (signal.SIGTERM, signal.default_int_handler),
-        (signal.SIGTERM, signal.SIG_IGN),  # in the background of a script
+        (signal.SIGINT, signal.default_int_handler, False),
+        (signal.SIGTERM, signal.default_int_handler, False),
+        (signal.SIGTERM, signal.SIG_IGN, False),  # in the background of a script
+        (signal.SIGTERM, signal.default_int_handler, True),
     ],
 )
 def test_an_interruption_is_handed_on_and_the_training_goes_on_later(
-    number: signal.Signals, of_ctrl_c: Any, request: pytest.FixtureRequest
+    number: signal.Signals, of_ctrl_c: Any, blocked: bool, request: pytest.FixtureRequest
 ) -> None:
     was = signal.signal(signal.SIGINT, of_ctrl_c)
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, was))
+    if blocked:
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        request.addfinalizer(lambda: signal.pthread_sigmask(signal.SIG_SETMASK, mask))
     signaller = subprocess.Popen(
         [
             sys.executable,
